@@ -18,6 +18,8 @@ from ..sizing.field import Field
 
 COARSER, FINER = 2.0, 1e-3
 """Ratios of the sizes of layers and of the field beside them that indicate a mistake."""
+THICKEST, FLATTEST, THINNEST = 3.0, 1000.0, 0.02
+"""Limits of layers of prisms: all together and the first one over the size field, and the last one over it."""
 NARROWER = 0.8
 """Width of layers over the size field below which a run says so."""
 SAMPLE = 64
@@ -91,7 +93,7 @@ def widths_of_layers(field: Field, domain: Domain, layers: Sequence[Layers]) -> 
     """Return in words where the default width of layers is smaller than the size field, or an empty text."""
     found = []
     for k, layer in enumerate(layers):
-        if layer.spacing is None:
+        if layer.spacing is None and not domain.extrudes_layers:
             feet, normals = columns_of(domain, layer)
             places = (feet + layer.rows[-1] * normals)[:: -(-len(feet) // SAMPLE)]
             places = places[domain.contains(places)]
@@ -110,6 +112,8 @@ def layer_mismatches(name: str, layer: Layers, field: Field, domain: Domain) -> 
     Layers are usually finer than the field across the wall. But their width along the wall, if it is not given, can be
     far too small.
     """
+    if domain.extrudes_layers:
+        return _prism_mismatches(name, layer, field, domain)
     feet, normals = columns_of(domain, layer)
     some = slice(None, None, -(-len(feet) // SAMPLE))
     for row in sorted({0, layer.count - 1}):
@@ -127,6 +131,29 @@ def layer_mismatches(name: str, layer: Layers, field: Field, domain: Domain) -> 
                 f"{what}: their width is the last layer's height, because no spacing is given; do layers and size "
                 "field have the same unit? Otherwise give spacing, the width along the wall"
             ]
+    return []
+
+
+def _prism_mismatches(name: str, layer: Layers, field: Field, domain: Domain) -> list[str]:
+    """Return warnings if prisms are far thicker or flatter than the cells beside them."""
+    h = np.asarray(field(domain.boundary(layer.edges).landmarks(float(domain.extent.min()) / 8, SAMPLE)), float)
+    smallest, largest = float(h.min()), float(h.max())
+    if layer.thickness > THICKEST * smallest:
+        return [
+            f"{name} are {layer.thickness:.3g} thick where the size field is {smallest:.3g}, expected at most "
+            f"{THICKEST:g} times as much, as all cells beside them are compressed; use fewer or thinner layers"
+        ]
+    if largest > FLATTEST * layer.height:
+        return [
+            f"{name} have a first height of {layer.height:.3g} where the size field is {largest:.3g}: OpenFOAM's "
+            f"checkMesh rejects cells more than {FLATTEST:g} times as wide as high; use a larger height, or smaller "
+            "sizes there"
+        ]
+    if layer.heights[-1] < THINNEST * smallest:
+        return [
+            f"the last of {name} is {layer.heights[-1]:.3g} high beside cells of {smallest:.3g}, where sizes jump; use "
+            "more layers, or a larger growth"
+        ]
     return []
 
 

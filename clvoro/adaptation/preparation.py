@@ -10,7 +10,15 @@ import numpy as np
 
 from ..arguments import coincident_named, warn
 from ..errors import CoarseSizeWarning, InputError, SizeFieldError
-from ..geometry.boundary_layers import apart_from, check_gaps, count_rows, free_domain, place_layers
+from ..geometry.boundary_layers import (
+    apart_from,
+    beyond_layers,
+    check_extruded,
+    check_gaps,
+    count_rows,
+    free_domain,
+    place_layers,
+)
 from ..geometry.domain import Domain
 from ..geometry.fixed_generators import FixedGenerators
 from ..geometry.gaps import NARROW
@@ -121,6 +129,8 @@ def prepare(
     rows, free, field = _place_layers(stages, domain, given_field, options, len(fixed))
     if domain.lines is not None:
         field = limit_beside_lines(field, place_pairs(free, domain.lines.network(free), field))
+    if points is not None and domain.extrudes_layers:
+        points = points[beyond_layers(domain, options.layers, points)]
     sizing = Sizing(stages.engine, domain, field, gradient_step=GRADIENT_STEP)
     # The other methods keep the number of given points.
     kept = points is not None and not options.multilevel
@@ -221,6 +231,9 @@ def _place_layers(
     """Return the generators of the layers, the domain without them, and the size field limited beside them."""
     layers, n_cells = options.layers, options.n_cells
     if not layers:
+        return np.empty((0, domain.dim)), domain, field
+    if domain.extrudes_layers:
+        check_extruded(domain, layers)
         return np.empty((0, domain.dim)), domain, field
     check_memory(stages.engine, count_rows(domain, layers), domain)
     check_gaps(domain, layers)

@@ -455,11 +455,17 @@ class Run:
         size = mesh.to_host(mesh.h, mesh.domain.frame[1])
         error, quality = mesh.to_host(mesh.error), mesh.to_host(mesh.quality)
         origin, fixed = origins(labels, self.started, mesh.taken), mesh.setup.points
-        diagram = mesh.fetch_diagram()
+        diagram, settings = mesh.fetch_diagram(), dict(self._settings)
+        if self._options.layers and self._domain.extrudes_layers:
+            from ..finite_volumes.solid_walls.layers import add_layers
+
+            diagram, settings["thickness"] = add_layers(diagram, self._options.layers)
+            fixed = fixed[:0]  # vertices have moved, and generators with them
         if (home := diagram.home) is not None:
             # Cells may have been cut along creases: further parts come last. Generators in thin places may have none.
             own, home = home >= 0, np.where(home < 0, -1 - home, home)
             size, origin, fixed = size[home], np.where(own, origin[home], -1), fixed[home[own & (home < len(fixed))]]
+            size = np.where(diagram.layer > 0, np.cbrt(diagram.volumes), size)
             error, quality = self._measured_again(diagram, size)
         put_back(diagram, fixed)
         result = Result(
@@ -474,7 +480,7 @@ class Run:
             initial=self.initial,
             final=final,
             size_factor=mesh.size_factor,
-            settings=dict(self._settings),
+            settings=settings,
             origin=origin,
         )
         return without_holes(result)
@@ -487,8 +493,11 @@ class Run:
         length = np.cbrt(diagram.volumes)
         error = (length - size) / np.minimum(length, size)
         quality = cell_quality(diagram, np.add.reduceat(diagram.face_measures, diagram.neighbor_starts[:-1]))
+        row = self.rows[-1]
+        more = len(diagram) - int(row["cells"][0])
+        row["inserted" if more > 0 else "deleted"] += abs(more)
         for name, value in {"cells": len(diagram), **figures(error, quality)}.items():
-            self.rows[-1][name] = value
+            row[name] = value
         return error, quality
 
     def _note_end_of_trade(self, result: Result) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -28,7 +28,10 @@ LEAST_DETERMINANT = 1e-3
 
 @dataclass(frozen=True)
 class Limit:
-    """What `checkMesh` asks of a measure of cells or faces: values above it, or below, are rejected or warned of."""
+    """What `checkMesh` asks of a measure of cells or faces: values above it, or below, are rejected or warned of.
+
+    What it asks with the option ``-allGeometry`` only is `thorough`.
+    """
 
     name: str
     value: float
@@ -36,6 +39,7 @@ class Limit:
     of_cells: bool = False
     demanded: bool = True
     strict: bool = True
+    thorough: bool = False
 
     def broken(self, values: np.ndarray) -> np.ndarray:
         """Return which of `values` (k,) break it, (k,) bool."""
@@ -52,11 +56,11 @@ LIMITS = {
     "non_orthogonality": Limit("non-orthogonality", 90 - np.degrees(1e-15), strict=False),
     "pyramids": Limit("face pyramids", -1e-15, above=False),
     "skewness": Limit("skewness", 4),
-    "bad_tetrahedra": Limit("face tetrahedra", 0),
+    "bad_tetrahedra": Limit("face tetrahedra", 0, thorough=True),
     "flatness": Limit("flatness", 0.8, above=False, demanded=False),
-    "determinant": Limit("determinant", LEAST_DETERMINANT, above=False, of_cells=True),
-    "weight": Limit("interpolation weight", 0.05, above=False),
-    "volume_ratio": Limit("volume ratio", 0.01, above=False),
+    "determinant": Limit("determinant", LEAST_DETERMINANT, above=False, of_cells=True, thorough=True),
+    "weight": Limit("interpolation weight", 0.05, above=False, thorough=True),
+    "volume_ratio": Limit("volume ratio", 0.01, above=False, thorough=True),
 }
 """Limits of OpenFOAM by the names of `SolverMeasures`."""
 _MEASURES = {2: PlaneMeasures, 3: SolverMeasures}
@@ -144,6 +148,8 @@ def cells_beyond(
     faces = np.zeros(len(mesh), bool) if faces is None else faces
     for name in names:
         broken = LIMITS[name].broken(getattr(m, name))
+        if mesh.layer is not None and LIMITS[name].thorough:
+            broken &= judged_thoroughly(mesh)[0 if LIMITS[name].of_cells else 1]
         if LIMITS[name].of_cells:
             found |= broken
         else:
@@ -163,11 +169,17 @@ def _openfoam(mesh: Faces, judged: np.ndarray | None = None) -> list[Criterion]:
     of_faces = judged[owner]
     of_faces[: mesh.n_inner] |= judged[mesh.neighbor[: mesh.n_inner]]
     cells, faces = Rows(g.centroids, None, mesh.dim, judged), Rows(g.centers, owner, mesh.dim, of_faces)
+    thorough = (faces, cells)
+    if mesh.layer is not None:
+        of_cells, between = judged_thoroughly(mesh)
+        thorough = (replace(faces, judged=of_faces & between), replace(cells, judged=judged & of_cells))
 
     def judge(*names: str) -> list[Criterion]:
         of = [(LIMITS[name], getattr(m, name)) for name in names]
         return [
-            (cells if a.of_cells else faces)(a.name, v, a.value, above=a.above, demanded=a.demanded, strict=a.strict)
+            (thorough if a.thorough else (faces, cells))[a.of_cells](
+                a.name, v, a.value, above=a.above, demanded=a.demanded, strict=a.strict
+            )
             for a, v in of
         ]
 
@@ -186,10 +198,20 @@ def _openfoam(mesh: Faces, judged: np.ndarray | None = None) -> list[Criterion]:
         *judge("pyramids", "skewness", "bad_tetrahedra"),
         ends("edge length over size", m.edge_spans / span, 1e-6, above=False, demanded=False),
         *judge("flatness", "determinant"),
-        cells("concavity", concave, 0, failing=m.concave),
+        thorough[1]("concavity", concave, 0, failing=m.concave),
         *judge("weight", "volume_ratio"),
         regions(mesh),
     ]
+
+
+def judged_thoroughly(mesh: Faces) -> tuple[np.ndarray, np.ndarray]:
+    """Return which cells are in no layer of a solid, (n,) bool, and which faces have no cell in one, (f,) bool.
+
+    They are judged as `checkMesh` does with its option ``-allGeometry``, others as it does without it: cells in layers
+    are flat by intent.
+    """
+    cells = np.ones(mesh.n_cells, bool) if mesh.layer is None else mesh.layer == 0
+    return cells, cells[mesh.owner] & (cells[np.maximum(mesh.neighbor, 0)] | (mesh.neighbor < 0))
 
 
 def rejected_cells(mesh: Faces, judged: np.ndarray) -> np.ndarray:
@@ -198,8 +220,10 @@ def rejected_cells(mesh: Faces, judged: np.ndarray) -> np.ndarray:
     Only the faces `judged` (k,) are divided into tetrahedra, which takes the longest.
     """
     m, faces = mesh.measures, np.zeros(len(mesh), bool)
+    cells, between = judged_thoroughly(mesh)
+    judged = judged[between[judged]]
     faces[judged] = m.bad_tetrahedra_of(judged) > 0
-    return m.concave | cells_beyond(m, (*OF_CONVEX, "volumes", "face_areas", "pyramids"), faces)
+    return m.concave & cells | cells_beyond(m, (*OF_CONVEX, "volumes", "face_areas", "pyramids"), faces)
 
 
 def rejected_polygons(mesh: Faces) -> np.ndarray:

@@ -108,7 +108,8 @@ def _collapsed_polyhedra(mesh: Faces, diagram: Diagram, parts: np.ndarray, colla
 
     del parts
     mesh = replace(mesh, corners=mesh.corners.astype(np.int32, copy=False))
-    whole = mesh.domain.uncut is mesh.domain  # what short edges may become depends on the sides of a box
+    # What short edges may become depends on the sides of a box; those of layers are wanted.
+    whole = mesh.domain.uncut is mesh.domain and mesh.layer is None
     return collapse_short(mesh, diagram) if collapse and whole else mesh.compact()
 
 

@@ -1,4 +1,4 @@
-"""Boundary layers: rows of fixed generators along walls, for layers of cells with given heights."""
+"""Boundary layers: layers of cells with given heights along walls; in 2D rows of fixed generators."""
 
 from __future__ import annotations
 
@@ -29,12 +29,13 @@ _OWN = 0.9  # of its distance from its wall: a generator that is nearer to anoth
 
 @dataclass(frozen=True)
 class Layers:
-    """Boundary layers: layers of cells along walls, for `Adapter.run`, in 2D.
+    """Boundary layers: layers of cells along walls, for `Adapter.run`, in 2D and in solids.
 
-    Generators stand in columns normal to the wall and do not move. Where the wall is straight, their cells are
-    rectangles, and layer k has the height ``height * growth**k``. One more row beyond the last layer makes the outer
-    faces of that layer straight, too. Beyond it sizes grow from the width of the columns by the factor `growth` per
-    cell (see `sizing.Distance`), up to the size field.
+    In a `Solid` cells in layers are prisms over the polygons of the mesh on the wall: see below. In 2D generators stand
+    in columns normal to the wall and do not move. Where the wall is straight, their cells are rectangles, and layer k
+    has the height ``height * growth**k``. One more row beyond the last layer makes the outer faces of that layer
+    straight, too. Beyond it sizes grow from the width of the columns by the factor `growth` per cell (see
+    `sizing.Distance`), up to the size field.
 
     Parameters
     ----------
@@ -46,9 +47,11 @@ class Layers:
         Ratio of the heights of neighboring layers, at least 1.
     spacing : float, optional
         Largest width of the cells along the wall; by default the height of the last layer. OpenFOAM's `checkMesh`
-        refuses cells that are more than 89 times as wide as high.
+        refuses cells that are more than 89 times as wide as high. Not for solids, where prisms are as wide as the
+        cells beside them.
     edges : int, str, or sequence of them, optional
-        Numbers or names of edges of the `Polygon`, or of sides of the `Box`; by default all that are not periodic.
+        Numbers or names of edges of the `Polygon`, of sides of the `Box`, or of patches of the `Solid`; by default all
+        that are not periodic.
 
     Raises
     ------
@@ -64,6 +67,13 @@ class Layers:
     heights of the first layer. The rows go around these corners. Columns are narrower on curved walls, too: between the
     two ends of a cell the wall leaves their chord by at most a quarter of the first layer's height. So `spacing` need
     not follow the radius of a nose.
+
+    In a `Solid` the run meshes the whole solid. Then the polygons on the chosen patches move inwards by the thickness
+    of all layers, inner vertices follow them over some cells, and prisms fill what is left free. Where a patch with
+    layers meets one without at about a right angle, the sides of the prisms lie on that patch. Layers fill at most 0.15
+    of a gap from each side, taper to nothing at other borders and at sharp edges, and are thinner where cells would be
+    invalid: a warning says where, and ``settings["thickness"]`` of the result how thick they are. `n_cells` counts the
+    cells without prisms. OpenFOAM's `checkMesh` refuses prisms that are more than 1000 times as wide as high.
 
     Examples
     --------
@@ -202,7 +212,10 @@ def as_polygon(domain: Domain) -> tuple[Polygon, np.ndarray]:
     if domain.outline is not None:
         return domain.outline, domain.outline.oriented.edge_numbers
     if domain.dim != 2 or all(domain.periodic):
-        raise InputTypeError(f"layers are for a Box with walls or a Polygon in 2D, not for {domain}")
+        hint = "; write clvoro.Solid.box(lower, upper)" if domain.plain else ""
+        raise InputTypeError(
+            f"layers are for a Box with walls or a Polygon in 2D, and for a Solid, not for {domain}{hint}"
+        )
     (a, b), (c, d) = domain.lower, domain.upper
     return Polygon([(a, b), (c, b), (c, d), (a, d)]), np.array([2, 1, 3, 0])
 
@@ -310,6 +323,58 @@ def free_domain(domain: Domain, layers: Sequence[Layers]) -> Domain:
     inner = Polygon.from_shapely(shapely.MultiPolygon(parts))
     inner.framed_by = polygon
     return inner
+
+
+def check_extruded(domain: Domain, layers: Sequence[Layers]) -> None:
+    """Check layers of prisms in a solid.
+
+    Raises
+    ------
+    InputError
+        If a layer has a spacing, a patch has several layers, layers are thicker than the solid, or patches that meet
+        have layers of different count.
+    InputTypeError
+        If an item is not `Layers`.
+    """
+    count = np.zeros(len(domain.boundaries.index), np.int64)
+    for k, layer in enumerate(layers):
+        if not isinstance(layer, Layers):
+            raise InputTypeError(f"layers has a {type(layer).__name__}, expected clvoro.Layers")
+        if layer.spacing is not None:
+            raise InputError(
+                f"layers[{k}] has spacing = {layer.spacing:g}, expected none in a solid, where prisms are as wide as "
+                "the cells beside them; leave spacing out, and give the size field this value at the wall"
+            )
+        if not layer.thickness < np.linalg.norm(domain.extent) / 2:
+            raise InputError(_NO_ROOM)
+        walls = domain.boundaries.select("Layers edges", layer.edges)
+        if count[walls].any():
+            wall = walls[count[walls] > 0][0]
+            raise InputError(
+                f"layers[{k}] are on {domain.boundary_names[domain.boundary_index[wall]]!r}, which has other layers, "
+                "expected one of them for each patch; name other patches in edges"
+            )
+        count[walls] = layer.count
+    meeting = count[domain.meeting_walls]
+    wrong = np.flatnonzero((meeting > 0).all(axis=1) & (meeting[:, 0] != meeting[:, 1]))
+    if wrong.size:
+        one, other = (
+            domain.boundary_names[domain.boundary_index[wall]] for wall in domain.meeting_walls[wrong[0]].tolist()
+        )
+        a, b = meeting[wrong[0]].tolist()
+        raise InputError(
+            f"layers have count {a} on {one!r} and {b} on {other!r}, which meet at a crease, expected one count; give "
+            f"both count={max(a, b)}, with heights of your choice"
+        )
+
+
+def beyond_layers(domain: Domain, layers: Sequence[Layers], points: np.ndarray) -> np.ndarray:
+    """Return which of `points` (n, 3) in a solid are farther from its walls than the layers are thick, (n,) bool."""
+    beyond = np.ones(len(points), bool)
+    for layer in layers:
+        away = domain.boundary(layer.edges).distance2(points)
+        beyond &= away > layer.thickness**2
+    return beyond
 
 
 def apart_from(points: np.ndarray, rows: np.ndarray, free: Domain) -> np.ndarray:

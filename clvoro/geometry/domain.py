@@ -157,6 +157,14 @@ class Domain(ClipBox):
     curved_walls: bool = False
     """Whether walls may be curved. The faces on them need not be plane, and cells there are not quite Voronoi cells."""
 
+    extrudes_layers: bool = False
+    """Whether layers along walls are prisms, made when the mesh is read, and no rows of fixed generators."""
+
+    @property
+    def meeting_walls(self) -> np.ndarray:
+        """Pairs of walls that meet at creases, (k, 2) int; known where layers are prisms."""
+        return np.zeros((0, 2), np.int64)
+
     @property
     def plain(self) -> bool:
         """Whether the domain is its bounding box, with walls on all sides."""

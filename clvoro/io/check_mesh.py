@@ -28,7 +28,7 @@ _SYSTEM = {
 
 @dataclass(frozen=True)
 class CheckMeshResult:
-    """What `checkMesh -allGeometry -allTopology` says.
+    """What `checkMesh` says.
 
     Attributes
     ----------
@@ -63,14 +63,17 @@ def run_check_mesh(mesh: Result | Diagram, walls: WallShape = "straight") -> Che
         return check_case(case)
 
 
-def check_case(case: Path) -> CheckMeshResult:
-    """Return the verdict of `checkMesh`, which is installed, on the mesh of a case; its folder `system` is written."""
+def check_case(case: Path, thorough: bool = True) -> CheckMeshResult:
+    """Return the verdict of `checkMesh`, which is installed, on the mesh of a case; its folder `system` is written.
+
+    It is asked `thorough`ly with the options ``-allGeometry -allTopology``.
+    """
     (case / "system").mkdir(exist_ok=True)
     for file, text in _SYSTEM.items():
         head = f"FoamFile {{ version 2.0; format ascii; class dictionary; object {file}; }}\n"
         (case / "system" / file).write_text(head + text + "\n", encoding="ascii")
     settings = {"WM_PROJECT_DIR": str(_DEBIAN)} if _DEBIAN.is_dir() else {}
-    command = ["checkMesh", "-allGeometry", "-allTopology", "-case", str(case)]
+    command = ["checkMesh", *(("-allGeometry", "-allTopology") if thorough else ()), "-case", str(case)]
     done = subprocess.run(command, env={**settings, **os.environ}, capture_output=True, text=True, check=False)
     text = done.stdout + done.stderr
     stars = re.findall(r"^ *\*\*\*(.*)$", text, re.MULTILINE)

@@ -34,6 +34,7 @@ OWN = frozenset(
         "generator",
         "wall",
         "weight",
+        "layer",
     )
 )
 """Names of clvoro's own cell data in any format."""

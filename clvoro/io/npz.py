@@ -58,12 +58,13 @@ _SHAPES = {
     "diagram.face_vertex_starts": "M",
     "diagram.face_vertices": "f",
     "diagram.weights": "n",
+    "diagram.layer": "n",
     "initial.points": "ad",
     "initial.lloyd": "ad",
     "initial.poisson": "ad",  # before any were inserted
-    "final.points": "nd",
-    "final.lloyd": "nd",
-    "final.poisson": "nd",
+    "final.points": "bd",  # generators of a solid may have no cell, or several
+    "final.lloyd": "bd",
+    "final.poisson": "bd",
 }
 
 _INTEGERS = {
@@ -74,6 +75,7 @@ _INTEGERS = {
     "diagram.cell_vertices",
     "diagram.face_vertex_starts",
     "diagram.face_vertices",
+    "diagram.layer",
 }
 
 
@@ -203,7 +205,7 @@ def _assemble(arrays: dict[str, np.ndarray]) -> Result | Diagram:
 
 def _not_in(domain: Domain) -> tuple[str, ...]:
     """Return prefixes of the arrays that a diagram of `domain` does not have."""
-    others = ["weights"] if any(domain.periodic) else ["weights", "shifts"]
+    others = ["weights", "layer"] if any(domain.periodic) else ["weights", "layer", "shifts"]
     if domain.cell_dim == 3:
         others.append("cell_vert")
     elif not domain.cuts_cells:

@@ -248,6 +248,7 @@ def cell_data(contents: Contents) -> dict[str, np.ndarray]:
         **_on_boundaries(diagram.domain, diagram.half_faces.owner, diagram.neighbors, n),
         "generator": in_space(diagram.points),
         **({"weight": diagram.weights} if diagram.is_power else {}),
+        **({"layer": diagram.layer.astype(np.int32)} if diagram.layer.any() else {}),
         **{k: in_space(v) if v.shape[1:] == (2,) else v for k, v in contents.with_regions.items()},
     }
 

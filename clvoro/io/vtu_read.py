@@ -48,6 +48,7 @@ _USED = {
     "CellData.volume",
     "CellData.generator",
     "CellData.weight",
+    "CellData.layer",
     "CellData.label",
     "CellData.sides",
     "CellData.faces_of_cell",
@@ -222,6 +223,8 @@ def _assemble(arrays: dict[str, np.ndarray]) -> Result | Diagram:
     known |= _graph(arrays, Diagram(domain, known))
     if "CellData.weight" in arrays:
         known["weights"] = arrays["CellData.weight"].astype(float)
+    if "CellData.layer" in arrays:
+        known["layer"] = arrays["CellData.layer"].astype(np.int16)
     # The other arrays follow from the corners.
     rest = rebuild_on_sphere if domain.curved else rebuild
     diagram = Diagram(domain, {**known, **rest(Diagram(domain, known))})

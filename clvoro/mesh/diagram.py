@@ -94,6 +94,8 @@ class Diagram(MeshOutput):
     weights : (n,) float64
         Weights w of the generators in a power diagram, in the square of the domain's unit of length. Zeros in a Voronoi
         diagram.
+    layer : (n,) int16
+        Number of the layer of each cell along walls of a solid, 1 at the wall; 0 for other cells. See `clvoro.Layers`.
 
     Raises
     ------
@@ -138,6 +140,7 @@ class Diagram(MeshOutput):
         "face_vertex_starts",
         "face_vertices",
         "weights",
+        "layer",
     )
 
     def __init__(self, domain: Domain, arrays: Mapping[str, np.ndarray | Callable[[], np.ndarray]]) -> None:
@@ -175,6 +178,8 @@ class Diagram(MeshOutput):
             return np.zeros((len(self.neighbors), self.domain.dim), np.int8)
         if name == "weights":
             return np.zeros(len(self.points))
+        if name == "layer":
+            return np.zeros(len(self.points), np.int16)
         if name == "face_vertex_starts":
             return 2 * np.arange(len(self.cell_vertices) + 1, dtype=np.int32)
         from .connectivity import following
@@ -184,7 +189,7 @@ class Diagram(MeshOutput):
 
     def _there(self) -> list[str]:
         """Return the names of the arrays."""
-        derived = ["shifts", "weights"]
+        derived = ["shifts", "weights", "layer"]
         if "cell_vertices" in self._arrays:
             derived += ["face_vertex_starts", "face_vertices"]
         return [n for n in self._NAMES if n in derived or n in self._arrays]

@@ -68,6 +68,8 @@ class Faces(Sealed):
         face that the diagram does not have.
     diagram : Diagram or None
         The diagram that the measures of the faces come from; None if they follow from the corners, as in a solid.
+    layer : (n,) int16 or None
+        See `Diagram.layer`; None if no cell is in layers of a solid.
     """
 
     domain: Domain
@@ -81,6 +83,7 @@ class Faces(Sealed):
     shift: np.ndarray
     half_face: np.ndarray
     diagram: Diagram | None = None
+    layer: np.ndarray | None = None
 
     @property
     def dim(self) -> int:
@@ -313,6 +316,7 @@ class Faces(Sealed):
             corners=corners,
             owner=owner.astype(np.int32),
             neighbor=neighbor.astype(np.int32),
+            layer=None if self.layer is None else self.layer[cells],
         )
         return taken.compact(), np.unique(corners)
 
@@ -369,6 +373,7 @@ def make_faces(diagram: Diagram) -> Faces:
         shift=np.where(flipped[:, None], -shift, shift) if flipped.any() else shift,
         half_face=rows,
         diagram=None if diagram.domain.curved_walls else diagram,
+        layer=diagram.layer if diagram.layer.any() else None,
     )
 
 

@@ -147,6 +147,7 @@ def _in_space(d: Diagram, kept: np.ndarray, boundary: str | np.ndarray) -> Diagr
 def _arrays(d: Diagram, kept: np.ndarray, faces: np.ndarray, neighbors: np.ndarray) -> dict[str, np.ndarray]:
     """Return the arrays of the cells that are `kept`, (n,) bool, with the rows `faces` and new `neighbors`, (m,)."""
     arrays = {name: getattr(d, name)[kept] for name in ("points", "volumes", "centroids")}
+    arrays |= {"layer": d.layer[kept]} if d.layer.any() else {}
     arrays |= {name: getattr(d, name)[faces] for name in ("face_measures", "face_centroids")}
     arrays["neighbor_starts"] = np.concatenate([[0], np.cumsum(np.diff(d.neighbor_starts)[kept])]).astype(np.int32)
     arrays["neighbors"] = neighbors.astype(np.int32)

@@ -297,6 +297,7 @@ def diagram_of(faces: Faces) -> Diagram:
             "vertices": faces.points,
             "face_vertex_starts": lambda: loops()[0].astype(np.int32),
             "face_vertices": lambda: loops()[1].astype(np.int32),
+            **({} if faces.layer is None else {"layer": faces.layer}),
         },
     )
     diagram.faces = faces

@@ -184,7 +184,7 @@ class Solid(Domain):
     (1.0, 12, 8)
     """
 
-    curved_walls = True
+    curved_walls = extrudes_layers = True
 
     def __init__(
         self,
@@ -403,6 +403,11 @@ class Solid(Domain):
 
         return cls(**{**cylinder(begin, end, radius, edge), **options})
 
+    @property
+    def meeting_walls(self) -> np.ndarray:
+        """Pairs of patches that meet at creases, (k, 2) int."""
+        return self.creases.patches
+
     # Where points are.
 
     @cached_property
@@ -537,20 +542,31 @@ class Solid(Domain):
 
         From the middle of a triangle inwards. Walls that share a crease with the triangle's patch do not count.
         """
-        width = np.full(len(items), math.inf)
+        return self.clearance(self.surface.corners[items].mean(axis=1), -self.normals[items], reach, self.patch[items])
+
+    def clearance(self, points: np.ndarray, directions: np.ndarray, reach: np.ndarray, patch: np.ndarray) -> np.ndarray:
+        """Return how far the wall is that faces `points` (k, 3) of the surface, up to `reach` (k,); else inf; (k,).
+
+        Along unit vectors `directions` (k, 3). Walls that share a crease with `patch` (k,) do not count.
+        """
+        width = np.full(len(points), math.inf)
         meets = np.sort(self.creases.patches, axis=1) @ (self.n_patches, 1)
-        for first in range(0, len(items), _PROBES):
-            item, far = items[first : first + _PROBES], reach[first : first + _PROBES]
-            begin = self.surface.corners[item].mean(axis=1)
-            end = begin - far[:, None] * self.normals[item]
+        for first in range(0, len(points), _PROBES):
+            part = slice(first, first + _PROBES)
+            begin, along, far, mine = points[part], directions[part], reach[part], patch[part]
+            end = begin + far[:, None] * along
             who, other = self.surface.tree.meeting(np.minimum(begin, end), np.maximum(begin, end))
-            facing = np.einsum("ij,ij->i", self.normals[item[who]], self.normals[other]) < _FACING
-            pair = np.sort(self.patch[np.column_stack([item[who], other])], axis=1) @ (self.n_patches, 1)
+            facing = np.einsum("ij,ij->i", along[who], self.normals[other]) > -_FACING
+            pair = np.sort(np.column_stack([mine[who], self.patch[other]]), axis=1) @ (self.n_patches, 1)
             rows = np.flatnonzero(facing & ~np.isin(pair, meets))
             share = pierced(begin[who[rows]], end[who[rows]], self.surface.corners[other[rows]])
             seen = share > 1e-9
             np.minimum.at(width, first + who[rows[seen]], share[seen] * far[who[rows[seen]]])
         return width
+
+    def feet_on_patch(self, patch: int, points: np.ndarray) -> np.ndarray:
+        """Return the point of a patch that is nearest to each of `points` (k, 3), (k, 3)."""
+        return self._patches[patch].feet(points, math.inf).point
 
     @cached_property
     def curvature(self) -> np.ndarray:

@@ -183,6 +183,7 @@ class _DiagramReader:
     def diagram(self) -> Diagram:
         """Return the result, with the arrays that such a diagram has."""
         missing = ["cell_vert"] if self.engine.cell_dim == 3 else ["face_vert"] if self.cut is None else []
+        missing.append("layer")
         if self.codes is None:
             missing.append("shifts")
         if not self.t.is_power:

@@ -1,0 +1,574 @@
+"""Layers of prisms along walls of a solid: walls move inward, and their polygons are extruded back to the surface."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TYPE_CHECKING, cast
+
+import numpy as np
+import scipy
+
+from ...arguments import format_point, warn
+from ...errors import MismatchWarning
+from ...geometry.boundary_layers import Layers
+from ...mesh.connectivity import distinct, following, take_rows
+from ...mesh.diagram import Diagram
+from ...mesh.faces import Faces
+from ..gate import rejected_cells
+from .mesh import diagram_of
+
+if TYPE_CHECKING:
+    from ...geometry.solid.solid import Solid
+
+_SUITED = 0.25
+"""Largest distance of a moved vertex from where all its walls want it, over the thickness; else layers end there."""
+_LONGEST = 2.2
+"""Longest way of a vertex over the thickness: three walls at right angles need 1.73."""
+_SAME = 0.15
+"""Normals of walls that span less than this share of the largest direction count as one."""
+_OF_GAP = 0.15
+"""Share of the distance to the opposite wall that layers fill."""
+_SLOPE = 0.6
+"""Largest change of the thickness along a wall."""
+_DEPTH, _DEEPER = 2.0, 8.0
+"""How far from walls vertices follow: over h, and over the way of the wall."""
+_SWEEPS = 30
+"""Steps that make the way of inner vertices smooth."""
+_STIFFER = 20
+"""Steps that make the ways of the vertices of a cell linear."""
+_ROUNDS, _THINNER = 12, 0.6
+"""How often layers are made thinner where cells are rejected, and by which factor."""
+_FLAT = 500
+"""Prisms with a larger ratio of width and height are not made thinner."""
+_LEAST = 0.05
+"""Layers thinner than this share of the full thickness end."""
+_FULL = 0.9
+"""Layers count as full from this share of the thickness on."""
+
+
+def add_layers(diagram: Diagram, layers: Sequence[Layers]) -> tuple[Diagram, str]:
+    """Return the mesh of a solid with layers of prisms along patches, and how thick they are in words.
+
+    The polygons of these patches move inward by the thickness of the layers, and vertices near them follow. Between
+    the polygons and the surface are the prisms. They end at patches without layers, on which their sides lie.
+
+    Layers are thinner in gaps, and where cells would be invalid. They taper to nothing where they cannot end on a patch
+    without layers, or where patches meet at a sharp edge.
+
+    Parameters
+    ----------
+    diagram : Diagram
+        Of a `Solid`.
+    layers : sequence of Layers
+        As `check_extruded` accepts them.
+
+    Returns
+    -------
+    diagram : Diagram
+        The cells of `diagram`, then the prisms, polygon by polygon, the innermost first. Its `layer` says which one.
+    reached : str
+
+    Warns
+    -----
+    MismatchWarning
+        Where layers are thinner: how many polygons, and the place of the thinnest.
+    """
+    walls = _Walls(diagram, layers)
+    share = walls.first_shares()
+    best = None
+    for _ in range(_ROUNDS):
+        made = walls.extruded(share)
+        bad = walls.rejected(made)
+        if best is None or bad.count < best[0].count:
+            best = bad, made, share
+        if not bad.count:
+            break
+        share = walls.thinner(share, bad.vertices)
+    assert best is not None
+    _, made, share = best
+    faces, n = made.faces, len(diagram)
+    middles = faces.measures.geometry.centroids[n:]
+    found = diagram_of(replace(faces, generators=np.concatenate([faces.generators[:n], middles])))
+    assert diagram.home is not None
+    own = np.where(diagram.home < 0, -1 - diagram.home, diagram.home)
+    beside = walls.faces.owner[walls.rows[made.wall]]
+    found.home = np.concatenate([diagram.home, -1 - own[beside]])
+    return found, walls.reached(share, layers)
+
+
+@dataclass(frozen=True)
+class _Bad:
+    """Cells that OpenFOAM rejects: their number, and the vertices of walls whose layers are to blame, (k,) int."""
+
+    count: int
+    vertices: np.ndarray
+
+
+@dataclass(frozen=True)
+class _Made:
+    """A mesh with layers.
+
+    Attributes
+    ----------
+    faces : Faces
+    wall : (m,) int
+        The wall polygon, among those with layers, of each prism.
+    """
+
+    faces: Faces
+    wall: np.ndarray
+
+
+class _Walls:
+    """The walls of a mesh, as layers need them.
+
+    Attributes
+    ----------
+    faces : Faces
+        Of the mesh without layers.
+    rows : (w,) int
+        Its faces on walls.
+    patch : (w,) int
+    starts, corners : (w + 1,), (c,) int
+        Vertices around each of `rows`.
+    vertices : (u,) int
+        Vertices on walls, ascending; the arrays below have a row for each.
+    """
+
+    def __init__(self, diagram: Diagram, layers: Sequence[Layers]) -> None:
+        self.solid, self.faces = cast("Solid", diagram.domain), diagram.solver_mesh()
+        f = self.faces
+        self.rows = np.arange(f.n_inner, len(f))
+        self.patch = -1 - f.neighbor[self.rows].astype(np.int64)
+        self.starts, corners = take_rows(f.starts, f.corners, self.rows)
+        self.face = np.repeat(np.arange(len(self.rows)), np.diff(self.starts))
+        self.vertices, place = np.unique(corners, return_inverse=True)
+        self.corners = place.reshape(-1)
+        self.stiff = np.zeros(f.n_cells, bool)
+        self._read(layers)
+        self._meet()
+
+    def _read(self, layers: Sequence[Layers]) -> None:
+        """Set thickness and count of each patch, and the shares of the thickness at which its layers end."""
+        p = self.solid.n_patches
+        self.thickness, self.count = np.zeros(p), np.zeros(p, np.int64)
+        self.ends = np.ones((p, max(layer.count for layer in layers) + 1))
+        for layer in layers:
+            chosen = self.solid.boundaries.select("Layers edges", layer.edges)
+            self.thickness[chosen], self.count[chosen] = layer.thickness, layer.count
+            self.ends[chosen, : layer.count + 1] = np.concatenate([[0], np.cumsum(layer.heights) / layer.thickness])
+        self.layered = self.count[self.patch] > 0
+
+    def _meet(self) -> None:
+        """Set for each vertex the normals of its patches, and the way on which it moves by the full thickness.
+
+        `way` (u, 3) is 0 where layers end; `along` (u, 3, 3) projects a way onto all patches of the vertex.
+        """
+        p, u = self.solid.n_patches, len(self.vertices)
+        keys, pair = np.unique(self.corners * p + self.patch[self.face], return_inverse=True)
+        pair = pair.reshape(-1)
+        vector = self.faces.vectors[1][self.rows][self.face]
+        normal = np.stack([np.bincount(pair, vector[:, a], len(keys)) for a in range(3)], axis=1)
+        normal /= np.maximum(np.linalg.norm(normal, axis=1), 1e-300)[:, None]
+        self.pair_vertex, self.pair_patch = keys // p, keys % p
+        first = np.searchsorted(self.pair_vertex, np.arange(u + 1))
+        self.n_patches = np.diff(first)
+        normals, wanted = np.zeros((u, self.n_patches.max(), 3)), np.zeros((u, self.n_patches.max()))
+        place = np.arange(len(keys)) - first[self.pair_vertex]
+        normals[self.pair_vertex, place] = normal
+        wanted[self.pair_vertex, place] = -self.thickness[self.pair_patch]
+        solve = np.linalg.pinv(normals, rcond=_SAME)
+        self.along = np.eye(3) - solve @ normals
+        way = np.einsum("uij,uj->ui", solve, wanted)
+        off = np.abs(np.einsum("uji,ui->uj", normals, way) - wanted).max(axis=1)
+        full = np.abs(wanted).max(axis=1)
+        self.column = full > 0  # vertices of polygons with layers
+        # A border that is not at a wall of its own, and edges that more than two polygons share.
+        suited = self.column & (off < _SUITED * full) & (np.linalg.norm(way, axis=1) < _LONGEST * full)
+        self.way = np.where(suited[:, None], way, 0.0)
+        with_layers = np.bincount(self.pair_vertex, self.count[self.pair_patch] > 0, u)
+        self.border = suited & (with_layers < self.n_patches)
+        rows = np.flatnonzero(self.border)
+        wanted = self.faces.points[self.vertices[rows]] + self.way[rows]
+        off = np.linalg.norm(self._onto_patches(rows, wanted, bare=True) - wanted, axis=1)
+        self.way[rows[off > _SUITED * full[rows]]] = 0
+        self.border &= self.way.any(axis=1)
+        chosen = self.count[self.pair_patch] > 0
+        self.levels, self.level_ends = np.zeros(u, np.int64), np.zeros((u, self.ends.shape[1]))
+        np.maximum.at(self.levels, self.pair_vertex[chosen], self.count[self.pair_patch[chosen]])
+        np.add.at(self.level_ends, self.pair_vertex[chosen], self.ends[self.pair_patch[chosen]])
+        self.level_ends /= np.maximum(with_layers, 1)[:, None]
+        self._pair_sides()
+
+    def _pair_sides(self) -> None:
+        """Find for each side of a wall polygon that of the polygon beyond it; layers end where there is not one."""
+        begin, end = self.corners, self.corners[following(self.starts)]
+        low, high = np.minimum(begin, end), np.maximum(begin, end)
+        _, edge, number = np.unique(low * len(self.vertices) + high, return_inverse=True, return_counts=True)
+        edge = edge.reshape(-1)
+        order = np.argsort(edge, kind="stable")
+        twice = (number == 2)[edge[order]]
+        sides = order[twice].reshape(-1, 2)
+        self.beyond = np.arange(len(begin))
+        self.beyond[sides], self.begin, self.end = sides[:, ::-1], begin, end
+        alone = np.flatnonzero(self.beyond == np.arange(len(begin)))
+        self.way[np.concatenate([begin[alone], end[alone]])] = 0
+
+    def _onto_patches(self, rows: np.ndarray, places: np.ndarray, bare: bool = False) -> np.ndarray:
+        """Return for each vertex of `rows` (k,) the point near `places` (k, 3) on its patches, `bare` ones only."""
+        place = np.full(len(self.vertices), -1)
+        place[rows] = np.arange(len(rows))
+        mine = place[self.pair_vertex] >= 0
+        if bare:
+            mine &= self.count[self.pair_patch] == 0
+        row, patch = place[self.pair_vertex[mine]], self.pair_patch[mine]
+        found = places.copy()
+        for _ in range(3):  # by turns, where there are several
+            for p in np.unique(patch).tolist():
+                some = row[patch == p]
+                found[some] = self.solid.feet_on_patch(p, found[some])
+        return found
+
+    @cached_property
+    def sizes(self) -> np.ndarray:
+        """Size h at each vertex: the mean of the cells at walls, (u,)."""
+        h = np.cbrt(self.faces.volumes[self.faces.owner[self.rows]])[self.face]
+        count = np.bincount(self.corners, minlength=len(self.vertices))
+        return np.bincount(self.corners, h, len(self.vertices)) / count
+
+    def first_shares(self) -> np.ndarray:
+        """Return the shares (u,) of the full way that vertices move: less in gaps, and near places without layers."""
+        length = np.linalg.norm(self.way, axis=1)
+        share, rows = (length > 0).astype(float), np.flatnonzero(length)
+        x = self.faces.points[self.vertices[rows]]
+        order = np.argsort(~(self.count[self.pair_patch] > 0), kind="stable")  # those with layers first
+        patch = np.zeros(len(self.vertices), np.int64)
+        patch[self.pair_vertex[order[::-1]]] = self.pair_patch[order[::-1]]
+        room = self.solid.clearance(x, self.way[rows] / length[rows, None], length[rows] / _OF_GAP, patch[rows])
+        share[rows] = np.minimum(1, _OF_GAP * room / length[rows])
+        return self.smooth(share)
+
+    def smooth(self, share: np.ndarray) -> np.ndarray:
+        """Return `share` (u,), made smaller where it would change too fast along walls, or is near 0."""
+        share = np.where(share < _LEAST, 0.0, share)
+        length = np.linalg.norm(self.way, axis=1)
+        sides = np.flatnonzero(self.layered[self.face])
+        a, b = self.begin[sides], self.end[sides]
+        apart = np.linalg.norm(np.diff(self.faces.points[self.vertices[np.stack([a, b])]], axis=0)[0], axis=1)
+        while True:
+            high = share * length
+            most = np.full(len(share), np.inf)
+            for here, there in ((a, b), (b, a)):
+                np.minimum.at(most, here, high[there] + _SLOPE * apart)
+            lower = np.where(most < high, most / np.maximum(length, 1e-300), share)
+            lower[lower < _LEAST] = 0.0
+            # A prism with one side that is not flat would be a sliver.
+            active = np.bincount(self.face, lower[self.corners] > 0, len(self.rows))
+            lone = self.layered & (active == 1)
+            lower[self.corners[lone[self.face]]] = 0.0
+            if (lower >= share - 1e-3).all():
+                return np.minimum(share, lower)
+            share = np.minimum(share, lower)
+
+    def thinner(self, share: np.ndarray, bad: np.ndarray) -> np.ndarray:
+        """Return smaller shares (u,) at the vertices `bad`; around those that have no layers any more, too."""
+        gone = np.zeros(len(share), bool)
+        gone[bad[share[bad] == 0]] = True
+        bad = distinct(np.concatenate([bad, self.end[gone[self.begin]], self.begin[gone[self.end]]]))
+        less = share.copy()
+        less[bad] = np.where(share[bad] < _THINNER**5, 0.0, _THINNER * share[bad])
+        return self.smooth(less)
+
+    # Vertices that follow.
+
+    @cached_property
+    def _followers(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Vertices of the mesh that follow others (b,), those others (b,), and how much at first (b,).
+
+        First those of walls with layers, which slide along their patches, then all others near these.
+        """
+        x, moving = self.faces.points, self.way.any(axis=1)
+        found = []
+        taken = np.zeros(len(x), bool)
+        taken[self.vertices[self.column]] = True
+        creases = moving & (self.n_patches > 1)
+        smooth = moving & (self.n_patches < 3)
+        for leaders, free in ((creases, self.vertices[smooth]), (moving, np.flatnonzero(~taken))):
+            leaders = np.flatnonzero(leaders)
+            if not len(leaders):
+                continue
+            reach = _DEPTH * self.sizes[leaders] + _DEEPER * np.linalg.norm(self.way[leaders], axis=1)
+            tree = scipy.spatial.KDTree(x[self.vertices[leaders]])
+            away, near = tree.query(x[free], distance_upper_bound=reach.max())
+            rows = np.flatnonzero(np.isfinite(away))
+            rows = rows[away[rows] < reach[near[rows]]]
+            found.append((free[rows], leaders[near[rows]], 1 - away[rows] / reach[near[rows]]))
+        who, near, weight = (np.concatenate(parts) for parts in zip(*found, strict=True))
+        return who, near, weight
+
+    @cached_property
+    def _wall(self) -> np.ndarray:
+        """Row in `vertices` of each vertex of the mesh, -1 inside, (v,)."""
+        wall = np.full(len(self.faces.points), -1)
+        wall[self.vertices] = np.arange(len(self.vertices))
+        return wall
+
+    @cached_property
+    def _means(self) -> scipy.sparse.csr_array:
+        """The mean over the neighbors of each vertex that follows, (b, v). Those of walls are on the same walls."""
+        f, band, wall = self.faces, self._followers[0], self._wall
+        place = np.full(len(f.points), -1)
+        place[band] = np.arange(len(band))
+        begin, end = f.corners, f.corners[following(f.starts)]
+        begin, end = np.concatenate([begin, end]), np.concatenate([end, begin])
+        kept = place[begin] >= 0
+        key = distinct(begin[kept].astype(np.int64) * len(f.points) + end[kept])
+        begin, end = key // len(f.points), key % len(f.points)
+        on = np.flatnonzero(wall[begin] >= 0)
+        first = np.searchsorted(self.pair_vertex, np.arange(len(self.vertices) + 1))
+        starts, patch = take_rows(first, self.pair_patch, wall[begin[on]])
+        other = np.repeat(wall[end[on]], np.diff(starts))
+        known = self.pair_vertex * self.solid.n_patches + self.pair_patch
+        shared = (other >= 0) & np.isin(other * self.solid.n_patches + patch, known)
+        fits = np.ones(len(begin), bool)
+        fits[on] = np.add.reduceat(shared, starts[:-1]) == np.diff(starts) if len(on) else True
+        begin, end = begin[fits], end[fits]
+        row = place[begin]
+        weight = 1 / np.maximum(np.linalg.norm(f.points[end] - f.points[begin], axis=1), 1e-300)
+        weight /= np.bincount(row, weight, len(band))[row]
+        return scipy.sparse.csr_array((weight, (row, end)), (len(band), len(f.points)))
+
+    def moved(self, share: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return where each vertex of the mesh moves, (v, 3), and the points of walls above these, (u, 3)."""
+        x = self.faces.points
+        way, moved = share[:, None] * self.way, np.zeros_like(x)
+        moved[self.vertices] = way
+        band, near, weight = self._followers
+        on = np.flatnonzero(self._wall[band] >= 0)
+        rows = self._wall[band[on]]
+        start = weight[:, None] * moved[self.vertices[near]]
+        for sweep in range(_SWEEPS + 1):
+            moved[band] = self._means @ moved if sweep else start
+            moved[band[on]] = way[rows] + np.einsum("uij,uj->ui", self.along[rows], moved[band[on]])
+        self._stiffen(moved)
+        slid = moved[self.vertices] - way
+        rows = np.flatnonzero(np.linalg.norm(slid, axis=1) > 1e-9 * self.sizes)
+        walls = x[self.vertices]
+        walls[rows] = self._onto_patches(rows, walls[rows] + slid[rows])
+        moved += x
+        moved[self.vertices] = walls + way
+        rows = np.flatnonzero(self.border)
+        moved[self.vertices[rows]] = self._onto_patches(rows, moved[self.vertices[rows]], bare=True)
+        return moved, walls
+
+    def _stiffen(self, moved: np.ndarray) -> None:
+        """Make the ways `moved` (v, 3) nearly linear in the cells `stiff`, so that these stay convex."""
+        cells = np.flatnonzero(self.stiff)
+        if not len(cells):
+            return
+        f, free = self.faces, np.zeros(len(moved), bool)
+        free[self._followers[0]] = True
+        free &= self._wall < 0
+        starts, places = f.cell_faces()
+        _, sides = take_rows(starts, places, cells)
+        faces, of = f.sides()[1][sides], np.repeat(cells, np.diff(starts)[cells])
+        begin, corners = take_rows(f.starts, f.corners, faces)
+        key = distinct(np.repeat(of, np.diff(begin)) * len(moved) + corners)
+        cell, vertex = np.searchsorted(cells, key // len(moved)), key % len(moved)
+        count = np.bincount(cell)
+        middle = np.stack([np.bincount(cell, f.points[vertex, a]) for a in range(3)], axis=1) / count[:, None]
+        x = f.points[vertex] - middle[cell]
+        tensor = _sums(cell, x[:, :, None] * x[:, None, :])
+        inverse = np.linalg.pinv(tensor, rcond=1e-6, hermitian=True)
+        number = np.maximum(np.bincount(vertex, minlength=len(moved)), 1)
+        for _ in range(_STIFFER):
+            way = moved[vertex]
+            mean = _sums(cell, way) / count[:, None]
+            slope = inverse @ _sums(cell, x[:, :, None] * way[:, None, :])
+            fitted = mean[cell] + np.einsum("ki,kij->kj", x, slope[cell])
+            total = np.zeros_like(moved)
+            np.add.at(total, vertex, fitted)
+            rows = distinct(vertex[free[vertex]])
+            moved[rows] = total[rows] / number[rows, None]
+
+    # Prisms.
+
+    def extruded(self, share: np.ndarray) -> _Made:
+        """Return the mesh with layers whose thickness is `share` (u,) of the full one."""
+        f = self.faces
+        (moved, walls), active = self.moved(share), share > 0
+        here = self.layered & (np.bincount(self.face, active[self.corners], len(self.rows)) > 0)
+        chosen = np.flatnonzero(here)
+        counts = np.where(here, self.count[self.patch], 0)
+        innermost = f.n_cells + np.cumsum(counts) - counts
+        points, base = self._level_points(moved, walls, active)
+
+        def at(vertices: np.ndarray, level: int) -> np.ndarray:
+            """Return the points of wall vertices at a level, 0 on the surface."""
+            between = active[vertices] & (level < self.levels[vertices])
+            return np.where(between, base[vertices] + level, self.vertices[vertices])
+
+        others = np.setdiff1d(np.arange(len(f)), self.rows[chosen])
+        parts = [(*take_rows(f.starts, f.corners, others), f.owner[others], f.neighbor[others])]
+        for level in range(int(counts.max(initial=0)) + 1):
+            there = chosen[counts[chosen] >= level]
+            starts, corners = take_rows(self.starts, self.corners, there)
+            outside = innermost[there] + counts[there] - level
+            owner = np.where(level == counts[there], f.owner[self.rows[there]], outside - 1)
+            neighbor = outside if level else -1 - self.patch[there]
+            parts.append((starts, at(corners, level), owner, neighbor))
+            if level:
+                parts.append(self._sides(level, here, counts, innermost + counts - level, active, at))
+        prism = np.repeat(chosen, counts[chosen])
+        row = counts[prism] - (np.arange(len(prism)) + f.n_cells - innermost[prism])
+        return self._assembled(parts, points, moved, prism, row)
+
+    def _level_points(self, moved: np.ndarray, walls: np.ndarray, active: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the moved vertices and those of all levels but the innermost, (k, 3), and the first of these, (u,)."""
+        counts = np.where(active, self.levels, 0)
+        base = len(moved) + np.cumsum(counts) - counts
+        vertex = np.repeat(np.arange(len(active)), counts)
+        level = np.arange(len(vertex)) + len(moved) - base[vertex]
+        way = moved[self.vertices[vertex]] - walls[vertex]
+        points = walls[vertex] + self.level_ends[vertex, level][:, None] * way
+        sliding = np.flatnonzero(self.border[vertex] & (level > 0))
+        for k in np.unique(level[sliding]).tolist():
+            rows = sliding[level[sliding] == k]
+            points[rows] = self._onto_patches(vertex[rows], points[rows], bare=True)
+        return np.concatenate([moved, points]), base
+
+    def _sides(
+        self,
+        level: int,
+        here: np.ndarray,
+        counts: np.ndarray,
+        prism: np.ndarray,
+        active: np.ndarray,
+        at: Callable[[np.ndarray, int], np.ndarray],
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Return the faces between levels `level` - 1 and `level` as starts, corners, owners and neighbors."""
+        face, other = self.face, self.face[self.beyond]
+        there = here[face] & (counts[face] >= level) & (active[self.begin] | active[self.end])
+        inner = there & here[other]
+        side = np.flatnonzero((inner & (face < other)) | (there & ~here[other]))
+        a, b = self.begin[side], self.end[side]
+        corners = np.stack([at(a, level), at(b, level), at(b, level - 1), at(a, level - 1)], axis=1)
+        kept = np.stack([active[a], np.ones(len(a), bool), active[b], np.ones(len(a), bool)], axis=1)
+        neighbor = np.where(inner[side], prism[other[side]], -1 - self.patch[other[side]])
+        return np.append(0, np.cumsum(kept.sum(axis=1))), corners[kept], prism[face[side]], neighbor
+
+    def _assembled(
+        self,
+        parts: list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]],
+        points: np.ndarray,
+        moved: np.ndarray,
+        prism: np.ndarray,
+        row: np.ndarray,
+    ) -> _Made:
+        """Put all faces together."""
+        f = self.faces
+        counts = np.concatenate([np.diff(part[0]) for part in parts])
+        corners, owner, neighbor = (np.concatenate([part[k] for part in parts]) for k in (1, 2, 3))
+        inside = neighbor >= 0
+        order = np.lexsort((np.where(inside, neighbor, owner), np.where(inside, owner, -neighbor), ~inside))
+        starts, corners = take_rows(np.append(0, np.cumsum(counts)), corners, order)
+        moved = moved - f.points
+        sides, face = f.sides()
+        number = np.diff(f.starts)[face]
+        total = np.add.reduceat(moved[f.corners], f.starts[:-1])[face]
+        way = _sums(sides, total) / np.bincount(sides, number)[:, None]
+        k = len(order)
+        made = replace(
+            f,
+            generators=np.concatenate([f.generators + way, np.zeros((len(prism), 3))]),
+            points=points,
+            starts=starts,
+            corners=corners.astype(np.int32),
+            owner=owner[order].astype(np.int32),
+            neighbor=neighbor[order].astype(np.int32),
+            twin=np.full(k, -1),
+            shift=np.zeros((k, 3), np.int8),
+            half_face=np.full(k, -1),
+            layer=np.concatenate([np.zeros(f.n_cells, np.int16), row.astype(np.int16)]),
+        ).compact()
+        return _Made(made, prism)
+
+    # What is wrong.
+
+    @cached_property
+    def _near(self) -> tuple[np.ndarray, np.ndarray]:
+        """Cells with vertices that may move, and these with their neighbors, (n,) bool each."""
+        f, moving = self.faces, np.zeros(len(self.faces.points), bool)
+        moving[self._followers[0]] = moving[self.vertices[self.column]] = True
+        face = np.logical_or.reduceat(moving[f.corners], f.starts[:-1])
+        near = np.zeros(f.n_cells, bool)
+        k = f.n_inner
+        near[f.owner[face]] = near[f.neighbor[:k][face[:k]]] = True
+        around = near.copy()
+        around[f.owner[:k][near[f.neighbor[:k]]]] = around[f.neighbor[:k][near[f.owner[:k]]]] = True
+        return near, around
+
+    @cached_property
+    def _rejected_before(self) -> np.ndarray:
+        """Cells that OpenFOAM rejects without layers, (n,) bool."""
+        return self._rejected_of(self.faces, *self._near)
+
+    def _rejected_of(self, faces: Faces, judged: np.ndarray, kept: np.ndarray) -> np.ndarray:
+        """Return which of the cells `judged` (n,) OpenFOAM rejects; measures are those of the cells `kept`."""
+        part, found = faces.part(kept)[0], np.zeros(faces.n_cells, bool)
+        bad = rejected_cells(part, np.arange(len(part)))
+        if part.layer is not None:  # thinner prisms would not be better
+            bad &= (part.layer == 0) | (part.measures.aspect_ratio < _FLAT)
+        found[np.flatnonzero(kept)] = bad
+        return found & judged
+
+    def rejected(self, made: _Made) -> _Bad:
+        """Return the cells that OpenFOAM rejects because of layers; inner ones become `stiff` at first."""
+        n, g = self.faces.n_cells, self.faces
+        near, around = (np.concatenate([mask, np.ones(len(made.wall), bool)]) for mask in self._near)
+        bad = self._rejected_of(made.faces, near, around)
+        bad[:n] &= ~self._rejected_before
+        core = bad[:n] & self.stiff
+        self.stiff |= bad[:n]
+        # The vertices of their prisms, those of bad cells, and those that these follow.
+        sides, face = g.sides()
+        _, corners = take_rows(g.starts, g.corners, face[core[sides]])
+        wall, (band, leader, _) = self._wall.copy(), self._followers
+        inside = wall[band] < 0
+        wall[band[inside]] = leader[inside]
+        found = wall[distinct(corners)]
+        of_prisms = self.corners[np.isin(self.face, made.wall[np.flatnonzero(bad[n:])])]
+        return _Bad(int(bad.sum()), distinct(np.concatenate([of_prisms, found[found >= 0]])))
+
+    def reached(self, share: np.ndarray, layers: Sequence[Layers]) -> str:
+        """Return in words how thick the `layers` are; `share` (u,) is that at vertices. Warn where they are thin."""
+        sums = np.add.reduceat(share[self.corners], self.starts[:-1])
+        mean = sums / np.diff(self.starts)
+        area, center, found = self.faces.area[self.rows], self.faces.center[self.rows], []
+        for k, layer in enumerate(layers):
+            rows = np.flatnonzero(np.isin(self.patch, self.solid.boundaries.select("Layers edges", layer.edges)))
+            part, weight, thick = mean[rows], area[rows], layer.thickness
+            full = float(weight[part >= _FULL].sum() / weight.sum())
+            average = float((part * weight).sum() / weight.sum())
+            found.append(
+                f"layers[{k}] are {thick * part.min():.3g} to {thick * part.max():.3g} thick, {thick * average:.3g} in "
+                f"the mean, and {thick:.3g} on {100 * full:.3g} % of their walls"
+            )
+            if part.min() < _FULL:
+                place = format_point(center[rows[part.argmin()]])
+                warn(
+                    f"{found[-1]}: {np.count_nonzero(part < _FULL)} of {len(rows)} wall polygons have thinner ones, or "
+                    f"none, because of gaps, sharp edges or borders, the thinnest at {place}. Use thinner layers or "
+                    "smaller cells there, or give the patches around them layers, too",
+                    MismatchWarning,
+                )
+        return "; ".join(found)
+
+
+def _sums(rows: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Return the sum of the `values` (k, ...) of each row, (r, ...)."""
+    total = np.zeros((int(rows.max()) + 1, *values.shape[1:]))
+    np.add.at(total, rows, values)
+    return total
