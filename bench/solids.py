@@ -2,7 +2,7 @@
 
     python bench/solids.py [--only NAMES] [--runs NAMES] [--seeds N] [--resolutions NUMBERS] [--booleans N]
                            [--cells N] [--limit SECONDS] [--speed NUMBERS] [--domains NAMES] [--order SIZES]
-                           [--keep FOLDER]
+                           [--layers THICKNESS:COUNT:GROWTH,...] [--keep FOLDER]
                            [--pictures FOLDER] [--device NAME] [--dtype float32] [--json]
 
 The solids are in `bench/_solid_shapes.py`; they need trimesh, manifold3d, shapely, networkx and, for the gyroid,
@@ -20,6 +20,10 @@ With `--booleans N` the solids are N random booleans of boxes, balls and cylinde
 lists, with about `--cells` cells each, in a process that may crash or hang. Each is accepted, rejected, refused (by a
 message, before there is a mesh), or it fails: an exception, a crash, no end within the limit, a cell that is not
 closed, or walls that are off by more than 0.1 h in the mean.
+With `--layers` all patches of the solids have layers of prisms, such as `0.5:5:1.3`: 0.5 h thick, five layers, growth
+1.3. A row has the inner cells and the prisms, the mean thickness over the one given at the vertices of walls, the
+share of these with at least 0.9 of it, the mean first height where it is at least 0.9 of the one given, and the
+verdicts of `checkMesh` without and with its options.
 Pictures show each mesh cut open, with the patches in colors.
 """
 
@@ -32,6 +36,7 @@ import tempfile
 import time
 import traceback
 import warnings
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -184,6 +189,74 @@ def measure_booleans(options: argparse.Namespace, report: Report) -> str:
     return ", ".join(f"{verdicts.count(v)} {v}" for v in ("accepted", "rejected", "refused", "failed"))
 
 
+LAYER_COLUMNS = {
+    **{name: COLUMNS[name] for name in ("solid", "h")},
+    "layers": lambda r: r["layers"],
+    "cells": lambda r: f"{r['cells'] - r['prisms']} + {r['prisms']}",
+    "s": PLANE_COLUMNS["s"],
+    "mean e": COLUMNS["mean e"],
+    "thickness": lambda r: f"{r['thickness']:.3f}",
+    "full": lambda r: f"{100 * r['full']:.1f} %",
+    "first height": lambda r: f"{r['first']:.3f}",
+    **{name: COLUMNS[name] for name in ("non-orth. max, mean", "skewness", "volume")},
+    "aspect": lambda r: f"{r['aspect']:.0f}",
+    "checkMesh": lambda r: "Mesh OK" if r["plain"] else r["why"],
+    "with -allGeometry": PLANE_COLUMNS["checkMesh"],
+}
+_FULL = 0.9
+"""Layers count as full from this share of their thickness on."""
+
+
+def measure_layers(adapter: clvoro.Adapter, options: argparse.Namespace, report: Report) -> str:
+    """Add a row for each solid with layers on all patches, and return how many meshes `checkMesh` accepts."""
+    for name, level, given in product(names(options.only) or SHAPES, names(options.resolutions), names(options.layers)):
+        make, sizes = SHAPES[name]
+        h = sizes[int(level)]
+        thickness, count, growth = (float(x) for x in given.split(":"))
+        first = thickness * h / (growth ** np.arange(int(count))).sum()
+        layers = clvoro.Layers(first, int(count), growth)
+        row: dict[str, Any] = {"solid": name, "h": h, "layers": given, **dict.fromkeys(_EMPTY, float("nan"))}
+        row |= dict.fromkeys(("thickness", "full", "first", "aspect"), float("nan")) | {"prisms": 0, "plain": False}
+        with tempfile.TemporaryDirectory() as folder:
+            case = Path(folder) if options.keep is None else options.keep / f"{name}-{h:g}-{given}".replace(" ", "-")
+            try:
+                row |= measure(adapter, solid_of(make(), repair=name == "dirty"), h, case, layers=layers)
+                verdict = check_case(case, thorough=False)
+                row |= {"plain": verdict.ok, "why": "; ".join(verdict.complaints)} | reached(row["result"], layers)
+                if options.pictures is not None:
+                    draw(row["result"], options.pictures / f"{name}-{h:g}-{given}.png", f"{name}, layers {given}")
+            except ClvoroError as error:
+                row |= {"ok": False, "cells": 0, "complaints": "", "why": f"{type(error).__name__}: {error}"}
+        row.pop("result", None)
+        report.add(row, f"{name}, {h:g}, {given}: {'OK' if row['plain'] else row['why']}")
+    good = sum(row["plain"] for row in report.records)
+    return f"{good} of {len(report.records)} meshes with layers pass checkMesh"
+
+
+def reached(result: clvoro.Result, layers: clvoro.Layers) -> dict[str, float]:
+    """Return how thick layers are, by the distances of their vertices from the surface."""
+    d, f = result.diagram, result.diagram.faces
+    k = f.n_inner
+    one, other, count = d.layer[f.owner[:k]], d.layer[f.neighbor[:k]], layers.count
+
+    def away(faces: np.ndarray) -> np.ndarray:
+        corners = [f.corners[f.starts[i] : f.starts[i + 1]] for i in np.flatnonzero(faces).tolist()]
+        return d.domain.boundary_distance(f.points[np.unique(np.concatenate([*corners, np.zeros(0, int)]))])
+
+    thick = away((one == 0) & (other == count)) / layers.thickness
+    first = (away(np.minimum(one, other) == 1) if count > 1 else thick * layers.thickness) / layers.height
+    # Each of these vertices has one on the wall above; other walls count as layers of no thickness.
+    bare = len(np.unique(f.corners[f.starts[k] :])) - len(thick)
+    thick = np.concatenate([thick, np.zeros(max(bare, 0))])
+    return {
+        "prisms": int((d.layer > 0).sum()),
+        "thickness": float(thick.mean()),
+        "full": float((thick > _FULL).mean()),
+        "first": float(first[first > _FULL].mean()) if (first > _FULL).any() else float("nan"),
+        "aspect": float(f.measures.aspect_ratio.max()),
+    }
+
+
 SPEED_COLUMNS = {
     "domain": lambda r: r["domain"],
     "triangles": lambda r: r["triangles"],
@@ -289,6 +362,7 @@ def main() -> None:
     options_of.add_argument("--keep", type=Path, metavar="FOLDER", help="keep the cases, with checkMesh.log")
     options_of.add_argument("--pictures", type=Path, metavar="FOLDER")
     options_of.add_argument("--order", default="", metavar="SIZES", help="errors of volume and area at these sizes")
+    options_of.add_argument("--layers", default="", metavar="LAYERS", help="thickness / h:count:growth, as 0.5:5:1.3")
     options_of.add_argument("--domains", default="", metavar="NAMES", help="of --speed: box, cube, body")
     options = options_of.parse_args()
     if options.order:
@@ -305,6 +379,9 @@ def main() -> None:
     if options.booleans:
         report = Report(options.json, BOOLEAN_COLUMNS)
         return report.finish(heading(adapter, measure_booleans(options, report)))
+    if options.layers:
+        report = Report(options.json, LAYER_COLUMNS)
+        return report.finish(heading(adapter, measure_layers(adapter, options, report)))
     report = Report(options.json, COLUMNS)
     levels = [int(k) for k in names(options.resolutions)]
     cases: list[tuple[str, Any, float]] = []

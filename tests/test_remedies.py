@@ -48,6 +48,7 @@ GLOBE = clvoro.Sphere(1)
 LINED = BOX.with_lines([[(0.1, 0.5), (0.9, 0.5)]])
 WELLS = np.column_stack([np.linspace(0.1, 0.9, 9), np.full(9, 0.1)])
 TRIANGLES = [(0, 2, 1), (0, 1, 3), (1, 2, 3), (0, 3, 2)]
+BLOCK, FIRST = clvoro.Solid.box((0, 0, 0), (1, 1, 1)), clvoro.Layers(0.01, 2, edges=["xMin"])
 TURNED = np.array(TRIANGLES)[:, ::-1]
 CORNERS = np.array([(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)], float)
 POINTS = np.random.default_rng(5).random((30, 2))
@@ -904,6 +905,18 @@ ROWS = [
     (
         lambda t: t.run(clvoro.Polygon(KITE), 0.1, layers=clvoro.Layers(0.7, 1, edges=[1])),
         lambda t: t.run(clvoro.Polygon(KITE), 0.1, layers=clvoro.Layers(0.02, 1, edges=[1])),
+    ),
+    (
+        lambda t: t.run(BLOCK, 0.4, layers=clvoro.Layers(0.01, 2, spacing=0.1)),
+        lambda t: t.run(BLOCK, 0.4, layers=clvoro.Layers(0.01, 2)),
+    ),
+    (
+        lambda t: t.run(BLOCK, 0.4, layers=[clvoro.Layers(0.01, 2), clvoro.Layers(0.02, 2, edges=["zMax"])]),
+        lambda t: t.run(BLOCK, 0.4, layers=[FIRST, clvoro.Layers(0.02, 2, edges="zMax")]),
+    ),
+    (
+        lambda t: t.run(BLOCK, 0.4, layers=[FIRST, clvoro.Layers(0.02, 3, edges="zMax")]),
+        lambda t: t.run(BLOCK, 0.4, layers=[FIRST, clvoro.Layers(0.02, 2, edges="zMax")]),
     ),
     # Plausible mistakes: size functions, points, polygons, arithmetic of size fields.
     (lambda t: t.run(BOX, lambda x, y: 0.3 + 0 * x), lambda t: t.run(BOX, lambda points: 0.3 + 0 * points[:, 0])),

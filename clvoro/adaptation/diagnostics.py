@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
@@ -15,6 +16,9 @@ from ..mesh.diagram import Diagram
 from ..mesh.results import Result
 from ..sizing import Sizing
 from ..sizing.field import Field
+
+if TYPE_CHECKING:
+    from ..geometry.surface import Surface
 
 COARSER, FINER = 2.0, 1e-3
 """Ratios of the sizes of layers and of the field beside them that indicate a mistake."""
@@ -136,7 +140,8 @@ def layer_mismatches(name: str, layer: Layers, field: Field, domain: Domain) -> 
 
 def _prism_mismatches(name: str, layer: Layers, field: Field, domain: Domain) -> list[str]:
     """Return warnings if prisms are far thicker or flatter than the cells beside them."""
-    h = np.asarray(field(domain.boundary(layer.edges).landmarks(float(domain.extent.min()) / 8, SAMPLE)), float)
+    walls = cast("Surface", domain.boundary(layer.edges))
+    h = np.asarray(field(walls.landmarks(float(domain.extent.min()) / 8, SAMPLE)), float)
     smallest, largest = float(h.min()), float(h.max())
     if layer.thickness > THICKEST * smallest:
         return [

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 import scipy
@@ -16,6 +17,9 @@ from .box import Box
 from .domain import Domain
 from .layer_columns import Chain, count_columns, count_fan, find_chains, place_columns, place_fan
 from .polygon import Polygon
+
+if TYPE_CHECKING:
+    from .surface import Surface
 
 _NEAR = 0.6  # of a cell: of two generators that are nearer to each other than this, one is dropped
 _SHORT = 1e-9  # of the domain: shorter edges of the region beyond the layers are dropped
@@ -372,7 +376,7 @@ def beyond_layers(domain: Domain, layers: Sequence[Layers], points: np.ndarray) 
     """Return which of `points` (n, 3) in a solid are farther from its walls than the layers are thick, (n,) bool."""
     beyond = np.ones(len(points), bool)
     for layer in layers:
-        away = domain.boundary(layer.edges).distance2(points)
+        away = cast("Surface", domain.boundary(layer.edges)).distance2(points)
         beyond &= away > layer.thickness**2
     return beyond
 

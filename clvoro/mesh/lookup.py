@@ -11,8 +11,12 @@ import shapely
 
 from ..arguments import check_integer
 from ..errors import InputError
+from .connectivity import take_rows
 from .diagram import Diagram
 from .read_only import Sealed
+
+_STEPS = 200
+"""Most cells on the way to the one that holds a point."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,7 +128,35 @@ class Locator:
         found[inside] = self.tree.query(lifted(self.diagram, self._place(x)))[1]
         if self.domain.cuts_cells:
             found[inside] = self._corrected(x, found[inside])
+        if self.diagram.layer.any():
+            found[inside] = self._walked(x, found[inside])
         return found
+
+    def _walked(self, x: np.ndarray, cells: np.ndarray) -> np.ndarray:
+        """Return the cells of a solid that hold the points `x` (k, 3), on the way from `cells` (k,) across faces.
+
+        With layers, the nearest generator may be that of a cell beside.
+        """
+        f, cells = self.diagram.faces, cells.astype(np.int64)
+        starts, places = f.cell_faces()
+        face = f.sides()[1]
+        moving, best, least = np.arange(len(x)), cells.copy(), np.full(len(x), np.inf)
+        for _ in range(_STEPS):
+            begin, side = take_rows(starts, places, cells[moving])
+            row, back = np.repeat(np.arange(len(moving)), np.diff(begin)), side >= len(f)
+            k = face[side]
+            beyond = ((x[moving][row] - f.center[k]) * f.normal[k]).sum(axis=1) * np.where(back, -1, 1)
+            behind = np.where(back, f.owner[k], f.neighbor[k])
+            beyond[behind < 0] = -np.inf
+            last = np.lexsort((beyond, row))[begin[1:] - 1]
+            better = beyond[last] < least[moving]
+            best[moving[better]], least[moving[better]] = cells[moving[better]], beyond[last][better]
+            going = beyond[last] > 0
+            moving = moving[going]
+            if not len(moving):
+                break
+            cells[moving] = behind[last[going]]
+        return best
 
     def _corrected(self, x: np.ndarray, cells: np.ndarray) -> np.ndarray:
         """Return the cells whose shape holds the points `x`, of which the nearest generators are those of `cells`."""

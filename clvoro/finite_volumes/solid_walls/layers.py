@@ -38,11 +38,13 @@ _SWEEPS = 30
 """Steps that make the way of inner vertices smooth."""
 _STIFFER = 20
 """Steps that make the ways of the vertices of a cell linear."""
-_ROUNDS, _THINNER = 12, 0.6
-"""How often layers are made thinner where cells are rejected, and by which factor."""
+_ROUNDS, _THINNER, _LAST_ROUNDS = 7, 0.6, 8
+"""How often layers are made thinner where cells are rejected, by which factor, and how often they end there."""
+_STEEP = 65.0
+"""Non-orthogonality, in degrees, beyond which cells count as rejected."""
 _FLAT = 500
 """Prisms with a larger ratio of width and height are not made thinner."""
-_LEAST = 0.05
+_LEAST = 0.08
 """Layers thinner than this share of the full thickness end."""
 _FULL = 0.9
 """Layers count as full from this share of the thickness on."""
@@ -75,17 +77,17 @@ def add_layers(diagram: Diagram, layers: Sequence[Layers]) -> tuple[Diagram, str
     MismatchWarning
         Where layers are thinner: how many polygons, and the place of the thinnest.
     """
-    walls = _Walls(diagram, layers)
+    walls = _LayeredWalls(diagram, layers)
     share = walls.first_shares()
     best = None
-    for _ in range(_ROUNDS):
+    for k in range(_ROUNDS + _LAST_ROUNDS):
         made = walls.extruded(share)
         bad = walls.rejected(made)
         if best is None or bad.count < best[0].count:
             best = bad, made, share
         if not bad.count:
             break
-        share = walls.thinner(share, bad.vertices)
+        share = walls.thinner(share, bad.vertices, _THINNER if k < _ROUNDS else 0.0)
     assert best is not None
     _, made, share = best
     faces, n = made.faces, len(diagram)
@@ -99,7 +101,7 @@ def add_layers(diagram: Diagram, layers: Sequence[Layers]) -> tuple[Diagram, str
 
 
 @dataclass(frozen=True)
-class _Bad:
+class _RejectedCells:
     """Cells that OpenFOAM rejects: their number, and the vertices of walls whose layers are to blame, (k,) int."""
 
     count: int
@@ -107,7 +109,7 @@ class _Bad:
 
 
 @dataclass(frozen=True)
-class _Made:
+class _Layered:
     """A mesh with layers.
 
     Attributes
@@ -121,7 +123,7 @@ class _Made:
     wall: np.ndarray
 
 
-class _Walls:
+class _LayeredWalls:
     """The walls of a mesh, as layers need them.
 
     Attributes
@@ -272,13 +274,13 @@ class _Walls:
                 return np.minimum(share, lower)
             share = np.minimum(share, lower)
 
-    def thinner(self, share: np.ndarray, bad: np.ndarray) -> np.ndarray:
+    def thinner(self, share: np.ndarray, bad: np.ndarray, factor: float) -> np.ndarray:
         """Return smaller shares (u,) at the vertices `bad`; around those that have no layers any more, too."""
         gone = np.zeros(len(share), bool)
         gone[bad[share[bad] == 0]] = True
         bad = distinct(np.concatenate([bad, self.end[gone[self.begin]], self.begin[gone[self.end]]]))
         less = share.copy()
-        less[bad] = np.where(share[bad] < _THINNER**5, 0.0, _THINNER * share[bad])
+        less[bad] *= factor
         return self.smooth(less)
 
     # Vertices that follow.
@@ -395,7 +397,7 @@ class _Walls:
 
     # Prisms.
 
-    def extruded(self, share: np.ndarray) -> _Made:
+    def extruded(self, share: np.ndarray) -> _Layered:
         """Return the mesh with layers whose thickness is `share` (u,) of the full one."""
         f = self.faces
         (moved, walls), active = self.moved(share), share > 0
@@ -466,7 +468,7 @@ class _Walls:
         moved: np.ndarray,
         prism: np.ndarray,
         row: np.ndarray,
-    ) -> _Made:
+    ) -> _Layered:
         """Put all faces together."""
         f = self.faces
         counts = np.concatenate([np.diff(part[0]) for part in parts])
@@ -493,7 +495,7 @@ class _Walls:
             half_face=np.full(k, -1),
             layer=np.concatenate([np.zeros(f.n_cells, np.int16), row.astype(np.int16)]),
         ).compact()
-        return _Made(made, prism)
+        return _Layered(made, prism)
 
     # What is wrong.
 
@@ -519,12 +521,14 @@ class _Walls:
         """Return which of the cells `judged` (n,) OpenFOAM rejects; measures are those of the cells `kept`."""
         part, found = faces.part(kept)[0], np.zeros(faces.n_cells, bool)
         bad = rejected_cells(part, np.arange(len(part)))
+        steep = part.measures.non_orthogonality > _STEEP
+        bad[part.owner[steep]] = bad[part.neighbor[steep]] = True  # no wall has an angle
         if part.layer is not None:  # thinner prisms would not be better
             bad &= (part.layer == 0) | (part.measures.aspect_ratio < _FLAT)
         found[np.flatnonzero(kept)] = bad
         return found & judged
 
-    def rejected(self, made: _Made) -> _Bad:
+    def rejected(self, made: _Layered) -> _RejectedCells:
         """Return the cells that OpenFOAM rejects because of layers; inner ones become `stiff` at first."""
         n, g = self.faces.n_cells, self.faces
         near, around = (np.concatenate([mask, np.ones(len(made.wall), bool)]) for mask in self._near)
@@ -540,7 +544,7 @@ class _Walls:
         wall[band[inside]] = leader[inside]
         found = wall[distinct(corners)]
         of_prisms = self.corners[np.isin(self.face, made.wall[np.flatnonzero(bad[n:])])]
-        return _Bad(int(bad.sum()), distinct(np.concatenate([of_prisms, found[found >= 0]])))
+        return _RejectedCells(int(bad.sum()), distinct(np.concatenate([of_prisms, found[found >= 0]])))
 
     def reached(self, share: np.ndarray, layers: Sequence[Layers]) -> str:
         """Return in words how thick the `layers` are; `share` (u,) is that at vertices. Warn where they are thin."""
