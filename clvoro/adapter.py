@@ -64,6 +64,8 @@ class Adapter:
     on_build : callable, optional
         Called by a first run with the number of kernels that are built, and of those that it needs. Without it such a
         run shows a line on the terminal, if the standard error is one.
+    on_work : callable, optional
+        Called with the name of each part of the work after the last step: that at the walls of a solid.
 
     Raises
     ------
@@ -107,6 +109,7 @@ class Adapter:
         self._watch: Callable[[np.void], None] | None = None
         self.on_memory: Callable[[float], object] | None = None
         self.on_build: Callable[[int, int], object] | None = None
+        self.on_work: Callable[[str], object] | None = None
 
     def __repr__(self) -> str:
         return f"Adapter({self.dtype.name} on {self.queue.device.name.strip()})"
@@ -321,7 +324,11 @@ class Adapter:
             with report_builds(stages.engine, self.on_build) as notice:
                 shown = self._shown(callback, notice)
                 run = Run(stages, domain, size, own, fixed, merged, checkpoint, shown, self.on_memory)
-                return run.conclude(on_interrupt)
+                stages.engine.pool.on_work = self.on_work
+                try:
+                    return run.conclude(on_interrupt)
+                finally:
+                    stages.engine.pool.on_work = None
 
     def start(
         self,

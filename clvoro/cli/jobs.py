@@ -201,12 +201,13 @@ class Job:
                     shown.show_builds(built, total)
 
             adapter.on_memory, adapter.on_build = announce, show_builds
+            adapter.on_work = None if shown is None else shown.show_work
             try:
                 result: Result = adapter.run(
                     self.case.domain, size, callback=callback, checkpoint=files, on_interrupt="return", **arguments
                 )
             finally:
-                adapter.on_memory = adapter.on_build = None
+                adapter.on_memory = adapter.on_build = adapter.on_work = None
         if result.stop_reason == INTERRUPTED:
             self.interrupted = True
         if self._land is not None:

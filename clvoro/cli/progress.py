@@ -95,6 +95,15 @@ class ProgressDisplay:
         """Show how many of the kernels of a first run are built."""
         self._change(f"{self.title}: building kernels, once for this device: {built} of {total}")
 
+    def show_work(self, part: str) -> None:
+        """Show a part of the work after the last step."""
+        text = f"{self.title}: {part}"
+        self._change(text)
+        now = time.monotonic()
+        if not self.live and min(now - self._shown, now - self._began) >= EVERY:
+            self._shown = now
+            self.tell(text)
+
     def tell(self, text: str) -> None:
         """Write a permanent line above the changing one."""
         self.stream.write(f"\r{text}\x1b[K\n" if self.live else f"{text}\n")

@@ -57,6 +57,8 @@ class KernelPool:
         self._ranges: dict[tuple[int, str], Range] = {}
         self.on_kernel: Callable[[int], object] | None = None
         """Called with the number of kernels that have been taken, when there is a new one."""
+        self.on_work: Callable[[str], object] | None = None
+        """Called with the name of each part of long work on the host."""
 
     def take(self, program: cl.Program, name: str) -> cl.Kernel:
         """Return a kernel that is not in use."""

@@ -559,6 +559,19 @@ def test_terminal_shows_how_many_kernels_are_built():
     assert silent.getvalue() == ""
 
 
+def test_work_after_the_last_step_is_named(monkeypatch):
+    stream, log = Terminal(), io.StringIO()
+    with progress.ProgressDisplay("x", 5, stream) as shown:
+        shown(row(4, 4.0))
+        shown.show_work("walls of 9 cells")
+    assert "\rx: walls of 9 cells" in stream.getvalue()
+    shown = progress.ProgressDisplay("x", 5, log)
+    shown.show_work("short edges")  # soon
+    monkeypatch.setattr(progress, "EVERY", 0.0)
+    shown.show_work("walls")
+    assert log.getvalue() == "x: walls\n"
+
+
 @pytest.mark.parametrize("kind", ["log", "terminal"])
 def test_a_line_that_stays(kind):
     stream = io.StringIO() if kind == "log" else Terminal()

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache
+from itertools import count
 
 import numpy as np
 import scipy
@@ -131,7 +133,13 @@ def _close_to(surface: WallSurface, points: np.ndarray, reach: np.ndarray) -> tu
     return near[close], foot[close], distance[close]
 
 
-def solid_diagram(surface: WallSurface, points: np.ndarray, sizes: np.ndarray, whole: Faces) -> Diagram:
+def solid_diagram(
+    surface: WallSurface,
+    points: np.ndarray,
+    sizes: np.ndarray,
+    whole: Faces,
+    tell: Callable[[str], object] = lambda _: None,
+) -> Diagram:
     """Return the mesh of a solid as a diagram, without short edges at walls.
 
     Parameters
@@ -143,6 +151,8 @@ def solid_diagram(surface: WallSurface, points: np.ndarray, sizes: np.ndarray, w
         h at the generators.
     whole : Faces
         Of the diagram of the generators, and of `outer_generators` after them, in a box around the solid.
+    tell : callable
+        Called with the name of each part of the work.
 
     Raises
     ------
@@ -159,9 +169,12 @@ def solid_diagram(surface: WallSurface, points: np.ndarray, sizes: np.ndarray, w
     walls = np.full(len(near.sizes), CUT, np.int8)
     best, kept = None, walls
     since = 0
-    while since < _PATIENCE:
+    for attempt in count(1):
+        if since == _PATIENCE:
+            break
+        number = "" if attempt == 1 else f", attempt {attempt}"
         try:
-            made = _made(surface, near, walls)
+            made = _made(surface, near, walls, lambda part, number=number: tell(part + number))
         except InputError:  # a simpler cell of a thin part may be nothing
             if best is None:
                 raise
@@ -179,6 +192,7 @@ def solid_diagram(surface: WallSurface, points: np.ndarray, sizes: np.ndarray, w
         _simplify(walls, near, np.unique(made.home[made.rejected]))
     assert best is not None
     rejected = best.faces.generators[best.rejected]
+    tell("cells without walls")
     faces, home = near.put_back(best.faces, best.home, best.own)
     lost = np.setdiff1d(np.arange(len(points)), home)
     for rows, text in (
@@ -201,8 +215,9 @@ def solid_diagram(surface: WallSurface, points: np.ndarray, sizes: np.ndarray, w
     return diagram
 
 
-def _made(surface: WallSurface, near: NearWalls, walls: np.ndarray) -> _Made:
+def _made(surface: WallSurface, near: NearWalls, walls: np.ndarray, tell: Callable[[str], object]) -> _Made:
     """Return the cells near the surface without short edges and slivers; `walls` (p + 1,) says how they are made."""
+    tell(f"walls of {len(near.rows)} cells")
     raw = _Maker(surface, near, walls).mesh()
     home, own = raw.home, raw.own
     lost = np.setdiff1d(np.arange(len(near.rows)), home)
@@ -212,7 +227,9 @@ def _made(surface: WallSurface, near: NearWalls, walls: np.ndarray) -> _Made:
             f"{surface.solid} is too thin for cells of this size: {len(lost)} generators have no cell, the first at "
             f"{place}, where h is {near.sizes[lost[0]]:.3g}; use smaller cells there"
         )
+    tell("short edges at walls")
     faces = _collapsed(raw.faces, near.sizes[home])
+    tell("checks of cells at walls")
     rejected, tips = rejected_at_walls(faces)
     if len(rejected):  # where a face has been collapsed, another small one may bulge out
         faces = _collapsed(faces, near.sizes[home])

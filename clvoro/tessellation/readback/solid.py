@@ -42,6 +42,8 @@ def make_mesh(engine: Engine, domain: Solid, points: np.ndarray, sizes: np.ndarr
     InputError
         If round-off has made cells wrong, or the solid is too thin for the size of cells.
     """
+    tell = engine.pool.on_work or (lambda _: None)
+    tell("diagram of all cells")
     surface = WallSurface(domain, SurfaceSearch(engine, domain, domain.wall_triangles).nearest)
     points = off_middle(surface, points, sizes)
     outer = outer_generators(surface, points, sizes)
@@ -52,4 +54,4 @@ def make_mesh(engine: Engine, domain: Solid, points: np.ndarray, sizes: np.ndarr
     stages.release()
     faces = replace(whole.faces, diagram=None)
     del whole
-    return solid_diagram(surface, points, sizes, faces)
+    return solid_diagram(surface, points, sizes, faces, tell)
