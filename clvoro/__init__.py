@@ -16,12 +16,12 @@ Domains: `Box` (2D, 3D, periodic), `Polygon` (holes, pieces; GeoJSON, WKT, shape
 latitude, and finds the cells of oceans and limited areas. `curves` has circles, ellipses, wing sections and splines
 for boundaries. Sizes: numbers, functions of NumPy arrays, and the fields of `clvoro.sizing`.
 `adapt` returns a `Result`, `voronoi` a `Diagram` of given generators; both have arrays, `save`, `plot`, `check` and
-`transfer`, and `load` reads a saved result. `power_diagram` takes generators with weights; `transport` finds those with
-which cells have given volumes (`Transported`). `Adapter` is the full interface, on a device of your choice, with
-`MultilevelOptions`, `PaperOptions` and `Checkpoint`. Its `start` begins a `Run` that goes on step by step and follows
-other sizes. Ctrl-C raises `Interrupted`, which carries the mesh so far. Errors and warnings are in `clvoro.errors`,
-pictures in `clvoro.plotting`, times of kernels in `clvoro.profile`. The command is
-``clvoro``; begin with ``clvoro --help``.
+`transfer`, and `load` reads a saved result; `read_fields` reads fields from files of any program. `power_diagram` takes
+generators with weights; `transport` finds those with which cells have given volumes (`Transported`). `Adapter` is the
+full interface, on a device of your choice, with `MultilevelOptions`, `PaperOptions` and `Checkpoint`. Its `start`
+begins a `Run` that goes on step by step and follows other sizes. Ctrl-C raises `Interrupted`, which carries the mesh so
+far. Errors and warnings are in `clvoro.errors`, pictures in `clvoro.plotting`, times of kernels in `clvoro.profile`.
+The command is ``clvoro``; begin with ``clvoro --help``.
 """
 
 from . import curves, earth, foam, sizing
@@ -29,6 +29,7 @@ from .adaptation.options import Checkpoint, MultilevelOptions, PaperOptions
 from .adaptation.run import Run
 from .adapter import Adapter
 from .errors import ClvoroError, Interrupted
+from .fields import read_fields
 from .geometry.boundary_layers import Layers
 from .geometry.box import Box
 from .geometry.polygon import Polygon
@@ -69,6 +70,7 @@ __all__ = [
     "load",
     "power_diagram",
     "profile",
+    "read_fields",
     "sizing",
     "transport",
     "voronoi",

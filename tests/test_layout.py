@@ -40,6 +40,7 @@ ORDER = (
     "adapter",
     "shared",
     "foam",
+    "fields",
     "__init__",
     "cli",
     "__main__",

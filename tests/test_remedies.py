@@ -60,6 +60,7 @@ TWICE = np.concatenate([POINTS, POINTS[:1]])
 DISTANCE = sizing.Distance(sizing.Circle((0.5, 0.5), 0.2), h_min=0.1, growth=1.2)
 CASE = "size = 0.3\n[domain]\nlower = [0, 0]\nupper = [1, 1]\n[run]\neffort = 'fast'\n"
 RASTER = "{{ kind = 'raster', file = '{}', lower = [0, 0], upper = [1, 1] }}\n"
+FIELDS = "{{ kind = 'hessian', file = '{}', n_cells = 30, {} }}\n"
 CAPS = "{ kind = 'caps', h_max = 0.7, growth = 1.2, regions = [{ center = [0, 0], radius = 0.1, size = 0.5 }] }\n"
 LONLAT = "{{ kind = 'raster', file = '{}' }}\n"
 SPHERE_CASE = "size = 0.7\n[domain]\nkind = 'sphere'\nradius = 1\n[run]\neffort = 'fast'\n"
@@ -886,6 +887,28 @@ ROWS = [
         lambda t: sizing.hessian_size(GRID**4, (0, 0), (1, 1), n_cells=9, growth=1.1),
         lambda t: sizing.Graded(sizing.hessian_size(GRID**4, (0, 0), (1, 1), n_cells=9), 1.1),
     ),
+    # Fields in files.
+    (lambda t: clvoro.read_fields(t.fields(POINTS)), lambda t: clvoro.read_fields(t.fields(POINTS), domain=BOX)),
+    (
+        lambda t: clvoro.read_fields(t.fields(100 + POINTS), domain=BOX),
+        lambda t: clvoro.read_fields(t.fields(POINTS), domain=BOX),
+    ),
+    (
+        lambda t: clvoro.read_fields(t.fields(POINTS), domain=CUBE),
+        lambda t: clvoro.read_fields(t.fields(np.column_stack([POINTS, POINTS[:, 0]])), domain=CUBE),
+    ),
+    (
+        lambda t: clvoro.read_fields(t.fields(POINTS, u=np.full(30, np.nan)), domain=BOX),
+        lambda t: clvoro.read_fields(t.fields(POINTS, u=POINTS[:, 0]), domain=BOX),
+    ),
+    (
+        lambda t: clvoro.read_fields(t.fields(CORNERS), domain=GLOBE),
+        lambda t: clvoro.read_fields(t.fields(CORNERS), domain=CUBE),
+    ),
+    (
+        lambda t: t.case(CASE.replace("0.3\n", FIELDS.format(t.fields(POINTS), "growth = 1.3"))),
+        lambda t: t.case(CASE.replace("0.3\n", FIELDS.format(t.fields(POINTS), "fields = ['u'], growth = 1.3"))),
+    ),
     # Others.
     (lambda t: t.run(BOX, Formless()), lambda t: t.run(BOX, OnHost())),
     (lambda t: clvoro.load(t.renumbered()), lambda t: clvoro.load(t.saved())),
@@ -1029,6 +1052,11 @@ class Workplace(SimpleNamespace):
         saved = self.path("saved")
         self.adapter.run(BOX, 0.3, "fast", checkpoint=saved, callback=lambda row: row["step"] == 2)
         return clvoro.Checkpoint(resume=saved)
+
+    def fields(self, points, **values):
+        path = self.path("fields.npz")
+        np.savez(path, points=points, **(values or {"u": points[:, 0] ** 2}))
+        return path
 
     def case(self, text):
         return Case.from_toml(text, "a.toml").size_field()

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from os import PathLike
 from typing import Any
@@ -184,6 +185,25 @@ class Variables:
         """Return an attribute of a variable, texts as str; None without it."""
         return _plain(getattr(self._file.variables[name], key, None))
 
+    def dimensions(self, name: str) -> tuple[str, ...]:
+        """Return the names of the dimensions of a variable."""
+        return tuple(self._file.variables[name].dimensions)
+
+    def is_real(self, name: str) -> bool:
+        """Whether a variable has real numbers."""
+        found = self._file.variables[name]
+        return (found.dtype if hasattr(found, "dtype") else found.data.dtype).kind == "f"
+
+    def data(self, name: str) -> np.ndarray:
+        """Return a variable as float64, scaled, with NaN where it has no value."""
+        found = np.array(self._file.variables[name][...]).astype(float)
+        for key in ("_FillValue", "missing_value"):
+            empty = self.about(name, key)
+            if empty is not None:
+                found[found == float(np.ravel(empty)[0])] = np.nan
+        factor, offset = (self.about(name, key) for key in ("scale_factor", "add_offset"))
+        return found * float(1 if factor is None else factor) + float(0 if offset is None else offset)
+
     def attribute(self, key: str) -> Any:
         """Return an attribute of the file; None without it."""
         return _plain(getattr(self._file, key, None))
@@ -233,7 +253,7 @@ def read_ugrid(file: Variables) -> MeshInFile | None:
     if not meshes:
         return None
     mesh = meshes[0]
-    nodes, faces = (_lonlat_names(file, file.about(mesh, f"{what}_coordinates")) for what in ("node", "face"))
+    nodes, faces = (lonlat_names(file, file.about(mesh, f"{what}_coordinates")) for what in ("node", "face"))
     if nodes is None:
         raise FileError(_PLANE)
     if faces is None:
@@ -296,7 +316,7 @@ def _ragged(table: np.ndarray, counts: np.ndarray, bound: int, first: int, name:
     return found
 
 
-def _lonlat_names(file: Variables, coordinates: object) -> tuple[str, str] | None:
+def lonlat_names(file: Variables, coordinates: object) -> tuple[str, str] | None:
     """Return the longitude and the latitude among the names in `coordinates`; None without them."""
     found = {}
     for name in str(coordinates or "").split():
@@ -338,6 +358,16 @@ def _plain(value: Any) -> Any:
 _HDF5 = b"\x89HDF"
 
 
+@contextmanager
+def open_netcdf(path: str | PathLike[str]) -> Iterator[Variables]:
+    """Open a netCDF file of either version."""
+    with open_plain(path) as file:
+        head = file.read(4)
+        file.seek(0)
+        with _netcdf4(os.fspath(path)) if head == _HDF5 else scipy.io.netcdf_file(file, mmap=False) as found:
+            yield Variables(found)
+
+
 def load_netcdf(path: str | PathLike[str]) -> Result | Diagram:
     """Read the cells of a mesh on a sphere from a file by the MPAS mesh specification, UGRID or SCRIP.
 
@@ -350,12 +380,9 @@ def load_netcdf(path: str | PathLike[str]) -> Result | Diagram:
         If the file is missing, damaged, of another format, of a mesh in the plane, or without generators; names the
         file and the fault.
     """
-    name = os.fspath(path)
-    with explained(path, "a netCDF file"), open_plain(path) as file:
-        head = file.read(4)
-        file.seek(0)
-        with _netcdf4(name) if head == _HDF5 else scipy.io.netcdf_file(file, mmap=False) as found:
-            cells = _read(Variables(found))
+    with explained(path, "a netCDF file"):
+        with open_netcdf(path) as found:
+            cells = _read(found)
         diagram = make_diagram(cells)
     if cells.of_run is None:
         return diagram

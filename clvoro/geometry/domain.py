@@ -559,6 +559,23 @@ class Domain(ClipBox):
         """Return the nearest point of the box to each of `points` (n, d)."""
         return np.where(self.periodic, points, np.clip(points, self.lower, self.upper))
 
+    def placed(self, what: str, places: np.ndarray, on_globe: bool) -> np.ndarray:
+        """Return places (n, k) of another program in the coordinates of this domain, (n, d).
+
+        `what` has them; `on_globe` says that they are longitudes and latitudes in degrees.
+
+        Raises
+        ------
+        InputError
+            If they have too few coordinates.
+        """
+        if places.shape[1] < self.dim:
+            raise InputError(
+                f"{what} has points with {places.shape[1]} coordinates, expected {self.dim} in {self}; add columns, or "
+                "lon and lat on a sphere"
+            )
+        return places[:, : self.dim]
+
     def narrowest(self, size: Callable[[np.ndarray], np.ndarray]) -> tuple[np.ndarray, float]:
         """Return a place (d,) where the domain is narrowest in units of the sizes `size`, and its width there."""
         del size

@@ -207,6 +207,16 @@ class Sphere(Domain):
         c, s = np.where(quarter, 0, np.cos(lat)), np.where(quarter, np.sign(lat), np.sin(lat))
         return self.radius * np.column_stack([c * np.cos(lon), c * np.sin(lon), s])
 
+    def placed(self, what: str, places: np.ndarray, on_globe: bool) -> np.ndarray:
+        """Return places (n, k) of another program on this sphere; theirs may have another radius."""
+        if on_globe:
+            return self.positions(places)
+        x = super().placed(what, places, on_globe)
+        lengths = np.linalg.norm(x, axis=1)
+        if not (lengths > 0).all() or np.ptp(lengths) > 1e-3 * lengths.max():
+            raise InputError(f"{what} has points off a sphere around (0, 0, 0); give a box or a solid as domain")
+        return x * (self.radius / lengths)[:, None]
+
     def icosahedral_points(self, bisections: int) -> np.ndarray:
         """Return the vertices of an icosahedron whose edges are bisected repeatedly, 10 * 4^k + 2 positions (n, 3).
 

@@ -12,7 +12,8 @@ import struct
 import sys
 import zlib
 from array import array
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from io import BufferedReader
 from itertools import pairwise
 from os import PathLike
 from typing import NoReturn
@@ -58,6 +59,9 @@ _USED = {
     "FieldData.border_shifts",
     "FieldData.bridges",
 }
+
+_TOPOLOGY = {"generator", "weight", "label", "sides", "faces_of_cell"}
+"""Cell data that are no fields."""
 
 
 class FileReader:
@@ -122,10 +126,11 @@ class FileReader:
 
     def read_all(self, file) -> dict[str, np.ndarray]:
         """Return the arrays that a mesh needs, by group and name."""
-        used = {name: entry for name, entry in self.entries.items() if name in _USED}
-        return {name: self._read(file, name, *entry) for name, entry in used.items()}
+        return {name: self.read(file, name) for name in self.entries if name in _USED}
 
-    def _read(self, file, name: str, kind: str, width: int, offset: int) -> np.ndarray:
+    def read(self, file, name: str) -> np.ndarray:
+        """Return an array by group and name."""
+        kind, width, offset = self.entries[name]
         if not 0 <= offset <= self.size - self.start - 8:
             raise FileError(f"{name} is beyond the end of the file")
         file.seek(self.start + offset)
@@ -190,17 +195,36 @@ def load_vtu(path: str | PathLike[str]) -> Result | Diagram:
     """
     with explained(path, "a .vtu file that save wrote"):
         with open_plain(path) as file:
-            head = file.read(LONGEST_HEAD)
-            end = head.find(MARK)
-            if end < 0:
-                raise FileError("it has no appended raw data, which files of clvoro have")
-            start = end + len(MARK)
-            size = os.fstat(file.fileno()).st_size
-            file.seek(max(0, size - len(END)))
-            if file.read() != END:
-                raise FileError("it is truncated, or has bytes behind its end")
-            arrays = FileReader(head[:end], start, size).read_all(file)
+            arrays = _open(file).read_all(file)
         return _assemble(arrays)
+
+
+def cell_data_of_vtu(path: str | PathLike[str], wanted: Iterable[str] | None) -> dict[str, np.ndarray] | None:
+    """Return cell data of a file of clvoro by name, those that are there; None for files of other programs."""
+    with open_plain(path) as file:
+        try:
+            reader = _open(file)
+        except FileError:
+            return None
+        if "FieldData.domain" not in reader.entries:
+            return None
+        there = {key.removeprefix("CellData."): key for key in reader.entries if key.startswith("CellData.")}
+        chosen = [n for n in there if n not in _TOPOLOGY and ":" not in n] if wanted is None else wanted
+        return {n: reader.read(file, there[n]).astype(float) for n in chosen if n in there}
+
+
+def _open(file: BufferedReader) -> FileReader:
+    """Return the head of a file of clvoro."""
+    head = file.read(LONGEST_HEAD)
+    end = head.find(MARK)
+    if end < 0:
+        raise FileError("it has no appended raw data, which files of clvoro have")
+    start = end + len(MARK)
+    size = os.fstat(file.fileno()).st_size
+    file.seek(max(0, size - len(END)))
+    if file.read() != END:
+        raise FileError("it is truncated, or has bytes behind its end")
+    return FileReader(head[:end], start, size)
 
 
 def _assemble(arrays: dict[str, np.ndarray]) -> Result | Diagram:

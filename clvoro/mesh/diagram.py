@@ -194,6 +194,12 @@ class Diagram(MeshOutput):
             derived += ["face_vertex_starts", "face_vertices"]
         return [n for n in self._NAMES if n in derived or n in self._arrays]
 
+    def with_arrays(self, **arrays: np.ndarray) -> Diagram:
+        """Return a diagram with other arrays of these names, and its own ones otherwise."""
+        made = Diagram(self.domain, {**self._arrays, **arrays})
+        made.home = self.home
+        return made
+
     def __dir__(self) -> list[str]:
         return [*super().__dir__(), *self._there()]
 

@@ -143,6 +143,25 @@ def test_sizes_from_a_solution(tmp_path):
     assert field(text, tmp_path)(points()) == pytest.approx(wanted(points()))
 
 
+def test_sizes_from_fields_of_other_programs(tmp_path):
+    x = np.random.default_rng(3).random((600, 2)) * (2, 1)
+    np.savez(tmp_path / "flow.npz", points=x, u=np.tanh(5 * (x[:, 0] - 1)), h=0.05 + 0.1 * x[:, 0])
+    text = "[size]\nkind = 'hessian'\nfile = 'flow.npz'\nfields = ['u']\nn_cells = 500\ngrowth = 1.3"
+    mesh, values = clvoro.read_fields(tmp_path / "flow.npz", domain=clvoro.Box((0, 0), (2, 1)))
+    wanted = sizing.hessian_size(values["u"], on=mesh, n_cells=500, growth=1.3)
+    assert field(text, tmp_path)(points()) == pytest.approx(wanted(points()))
+    sizes = "[size]\nkind = 'cells'\nfile = 'flow.npz'\nfield = 'h'"
+    assert field(sizes, tmp_path)(points()) == pytest.approx(0.05 + 0.1 * points()[:, 0], abs=5e-3)
+    for wrong, said in (
+        (text.replace("'u'", "'p'"), "it has no field p; it has u, h"),
+        (text + "\nat = 'nodes'", "size has at with fields; leave it out"),
+        (text.replace("fields = ['u']", ""), "size has growth without fields; name fields"),
+        (text.replace("fields = ['u']\n", "").replace("growth = 1.3", ""), "cannot be read as an array|shape"),
+    ):
+        with pytest.raises(InputError, match=said):
+            field(wrong, tmp_path)
+
+
 @pytest.mark.parametrize(
     ("text", "named"),
     [

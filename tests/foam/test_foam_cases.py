@@ -170,6 +170,25 @@ def content(folder):
     return {path.relative_to(folder): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
+def test_fields_of_a_case_are_read(case):
+    mesh, values = clvoro.read_fields(case, ["U", "p"])
+    assert mesh.domain.measure == pytest.approx(DOMAIN.measure)
+    assert set(mesh.domain.boundary_names) == set(DOMAIN.boundary_names)
+    assert values["U"].shape == (len(mesh), 2)
+    assert np.abs(values["U"] - velocity(mesh.points)[:, :2]).max() < 0.01
+    (case / "flow.foam").touch()
+    assert clvoro.read_fields(case / "flow.foam", "p", time=5)[1]["p"] == pytest.approx(values["p"])
+    with pytest.raises(InputError, match=r"it has no time 7; it has .*5"):
+        clvoro.read_fields(case, time=7)
+    with pytest.raises(InputError, match=r"it has no field T; it has .*U"):
+        clvoro.read_fields(case, "T")
+    shutil.rmtree(case / "5")
+    if (case / "0").exists():
+        shutil.rmtree(case / "0")
+    with pytest.raises(InputError, match="no time with fields"):
+        clvoro.read_fields(case)
+
+
 @pytest.mark.parametrize("known", [True, False])
 def test_one_cycle(case, known):
     """Of a mesh of clvoro, and of one of which nothing but OpenFOAM's files is known."""

@@ -150,6 +150,9 @@ class Case:
         moved = copy.deepcopy(self.table)
         taken: dict[str, Path] = {}
         for (node, key), source in zip(_files(moved), self.sources(), strict=True):
+            if source.is_dir() or source.suffix in (".foam", ".xdmf"):  # more than one file: it stays where it is
+                node[key] = str(source)
+                continue
             target = source.name
             while WRITTEN.fullmatch(target) or taken.setdefault(target, source) != source:
                 target = f"other-{target}"

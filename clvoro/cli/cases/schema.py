@@ -20,6 +20,7 @@ from msgspec import Meta
 from ... import earth, sizing
 from ...adaptation.options import EffortName, MethodName, Start
 from ...errors import InputError
+from ...fields import read_fields
 from ...files import LONGEST_GEOMETRY, read_text
 from ...geometry.box import Box
 from ...geometry.curves import Curve
@@ -220,7 +221,7 @@ RegionShape = (
 
 # Size fields.
 
-_ON_SPHERE = "caps, distance, expression, graded, raster or a combination of them"
+_ON_SPHERE = "fields in a file, or caps, distance, expression, graded, raster or a combination of them"
 
 
 class ConstantTable(Kind, tag="constant"):
@@ -313,17 +314,44 @@ class RasterTable(ArrayTable, tag="raster"):
         return self.over(domain.map_domain, load_array(path, "size.file"))
 
 
+class CellsTable(Kind, tag="cells"):
+    """Sizes in the cells, or at the points, of a file of any program."""
+
+    file: Text
+    field: Text
+    time: float | None = None
+
+    def build(self, folder: Path, domain: Any = None) -> Any:
+        mesh, values = read_fields(folder / self.file, self.field, domain=domain, time=self.time)
+        return sizing.OnCells(mesh, values[self.field])
+
+
+_OF_FIELDS, _OF_ARRAYS = ("time", "growth"), ("lower", "upper", "at", "missing")
+
+
 class Gradient(ArrayTable, tag="gradient"):
+    """Sizes from a solution: an array, or `fields` in the file of any program."""
+
     MAKE = staticmethod(sizing.gradient_size)
     CHOICE = ("n_cells", "eps")
+    fields: Annotated[list[Text], Meta(min_length=1)] | None = None
+    time: float | None = None
+    growth: Positive | None = None
     n_cells: Positive | None = None
     eps: Positive | None = None
     h_min: NotNegative | None = None
     h_max: Positive | None = None
 
     def build(self, folder: Path, domain: Any = None) -> Any:
-        _require(domain.map_domain is domain, self, _ON_SPHERE, domain)
-        return self.over(domain, load_array(folder / self.file, "size.file"))
+        unused = self.given().keys() & set(_OF_FIELDS if self.fields is None else _OF_ARRAYS)
+        if unused:
+            other, remedy = ("without", "name fields") if self.fields is None else ("with", "leave it out")
+            raise InputError(f"size has {', '.join(sorted(unused))} {other} fields; {remedy}")
+        if self.fields is None:
+            _require(domain.map_domain is domain, self, _ON_SPHERE, domain)
+            return self.over(domain, load_array(folder / self.file, "size.file"))
+        mesh, values = read_fields(folder / self.file, self.fields, domain=domain, time=self.time)
+        return type(self).MAKE(list(values.values()), on=mesh, **self.given("file", "fields", "time"))
 
 
 class Hessian(Gradient, tag="hessian"):
@@ -399,6 +427,7 @@ Size = (
     | RegionTable
     | ExpressionTable
     | RasterTable
+    | CellsTable
     | Hessian
     | Gradient
     | Feature
@@ -439,7 +468,7 @@ def load_array(path: Path, place: str) -> np.ndarray:
     except InputError as error:
         raise InputError(
             f"{place} names {str(path)!r}, which cannot be read as an array ({error}); "
-            "give a .npy file beside the case file"
+            "give a .npy file beside the case file, or fields = [...] of a file of another kind"
         ) from error
 
 

@@ -1,0 +1,389 @@
+"""Fields of other programs: values in cells or at points of a file, on a mesh of the domain to be adapted."""
+
+from __future__ import annotations
+
+import csv
+import warnings
+import zipfile
+from collections.abc import Callable, Iterable, Sequence
+from os import PathLike
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from .arguments import check_path
+from .earth.netcdf_read import Variables, lonlat_names, open_netcdf
+from .errors import InputError, InputTypeError, MismatchWarning
+from .files import open_plain
+from .foam.case import FoamCase
+from .foam.mesh import FoamMesh
+from .geometry.domain import Domain
+from .io import load
+from .io.arrays import FileError, explained, is_kind, read_array
+from .io.npz import FORMAT
+from .io.vtu_read import cell_data_of_vtu
+from .mesh.diagram import Diagram
+from .mesh.results import Result
+from .shared import voronoi
+from .sizing.arguments import coverage_warnings
+
+_SAME = 1e-9
+"""Places are the same, or on a wall, if they are nearer than this share of the domain's longest side."""
+_NEAR_WALL = 1e-3
+"""Places beyond a wall by less than this share of the domain are on it: walls of other meshes are facets of curves."""
+_NETCDF, _TABLES = (".nc", ".nc4", ".cdf", ".netcdf"), (".csv", ".txt", ".dat", ".tsv")
+_AXES = (("x", "y", "z"), ("lon", "lat"), ("longitude", "latitude"))
+
+
+class _Found(NamedTuple):
+    """Values by name, (n,) or (n, k), at places (n, d), which may be longitudes and latitudes; or on a mesh."""
+
+    values: dict[str, np.ndarray]
+    places: np.ndarray | None = None
+    on_globe: bool = False
+    mesh: Diagram | None = None
+    domain: Domain | None = None
+
+
+def read_fields(
+    path: str | PathLike[str],
+    fields: str | Sequence[str] | None = None,
+    *,
+    domain: Domain | None = None,
+    time: float | None = None,
+) -> tuple[Diagram, dict[str, np.ndarray]]:
+    """Read fields in cells or at points from the file of any program, with a mesh on which estimators take them.
+
+    The mesh has a generator at each place with values: the centers of cells, or points. So it does not matter of which
+    cells the file's own mesh consists, nor whether it has any::
+
+        mesh, found = clvoro.read_fields("flow.vtu", ["U", "p"], domain=channel)
+        size = clvoro.sizing.hessian_size([found["U"], found["p"]], on=mesh, n_cells=6000)
+
+    Its centroids are these places. A mesh that clvoro saved comes back as it was.
+
+    Parameters
+    ----------
+    path : str or path
+        - ``.vtu``, ``.npz`` of clvoro, with its ``cell_data``.
+        - ``.nc``: variables by UGRID, by the MPAS mesh specification, or with the attribute ``coordinates``. Places
+          without a value (``_FillValue``) are left out. netCDF-4 needs the package netCDF4.
+        - ``.csv``, ``.txt``, ``.dat``, ``.tsv``: a table with a line of names. Columns x, y (, z) or lon, lat are
+          places.
+        - ``.npz`` with an array ``points`` (n, d) and others (n,) or (n, k).
+        - The folder of a case of OpenFOAM, or a ``.foam`` file in it.
+        - Any other file that meshio reads, such as ``.vtu``, ``.vtk``, ``.xdmf``, ``.msh``, ``.e``. Of its cells those
+          of the highest dimension count.
+    fields : str or sequence of str, optional
+        Names; by default all fields with numbers: in cells, or else at points.
+    domain : Box, Polygon, Solid or Sphere, optional
+        The domain to be adapted. Meshes of clvoro and OpenFOAM have their own. Places outside are left out. Values at
+        the same place, as of both sides of a layer of cells, are averaged.
+    time : float, optional
+        A time of OpenFOAM, or the number of a time in a netCDF file, from 0. By default the last one.
+
+    Returns
+    -------
+    mesh : Diagram
+    values : dict of (n,) or (n, k) float64
+        By name, a row for each cell of `mesh`. Vectors in the plane have two components.
+
+    Raises
+    ------
+    InputError, InputTypeError
+        If the file cannot be read, has no such field or time, or has values that are not finite; if no domain is known,
+        or no place is inside it.
+
+    Warns
+    -----
+    MismatchWarning
+        If the places cover little of the domain.
+    """
+    name = check_path("path", path)
+    wanted = (fields,) if isinstance(fields, str) else None if fields is None else tuple(fields)
+    if wanted is not None and not (wanted and all(isinstance(one, str) for one in wanted)):
+        raise InputTypeError(f"fields is {fields!r:.60}, expected names of fields, or None for all")
+    with explained(name, "a file with fields"):
+        found = _reader(Path(name))(Path(name), wanted, time)
+    mesh, values = _on_mesh(name, found, domain)
+    for key, rows in values.items():
+        bad = np.flatnonzero(~np.isfinite(rows.reshape(len(rows), -1)).all(axis=1))
+        if len(bad):
+            raise InputError(
+                f"{name}: {key} is {rows[bad[0]]} at {mesh.centroids[bad[0]].tolist()}, expected finite values "
+                f"({len(bad)} of {len(rows)} are not); leave these rows out, or go back to an earlier time"
+            )
+    return mesh, values
+
+
+def _reader(path: Path) -> Callable[[Path, tuple[str, ...] | None, float | None], _Found]:
+    kind = path.suffix.lower()
+    if path.is_dir() or kind == ".foam":
+        return _of_openfoam
+    if kind in _NETCDF:
+        return _of_netcdf
+    if kind in _TABLES:
+        return _of_table
+    if kind == ".npz":
+        return _of_clvoro if is_kind(path, FORMAT) else _of_arrays
+    if kind == ".vtu":
+        with open_plain(path):  # an error if it is missing
+            own = cell_data_of_vtu(path, ())
+        return _of_meshio if own is None else _of_clvoro
+    return _of_meshio
+
+
+def _chosen(wanted: Iterable[str] | None, present: Iterable[str]) -> list[str]:
+    """Return the names that are wanted, all by default.
+
+    Raises
+    ------
+    FileError
+        If one is absent, or there are none.
+    """
+    there = list(present)
+    absent = [name for name in wanted or () if name not in there]
+    if absent or not there:
+        raise FileError(f"it has no field {', '.join(absent) or 'at all'}; it has {', '.join(there) or 'none'}")
+    return list(wanted or there)
+
+
+def _one_time(time: float | None) -> None:
+    if time is not None:
+        raise FileError(f"it has no times, and time is {time:g}; leave it out")
+
+
+def _of_clvoro(path: Path, wanted: tuple[str, ...] | None, time: float | None) -> _Found:
+    _one_time(time)
+    mesh = load(path)
+    if path.suffix.lower() == ".npz":
+        with zipfile.ZipFile(path) as archive:
+            names = [n.removesuffix(".npy") for n in archive.namelist()]
+        there = {n.removeprefix("cell_data."): n for n in names if n.startswith("cell_data.")}
+        values = {n: read_array(path, there[n]).astype(float) for n in _chosen(wanted, there)}
+    else:
+        values = cell_data_of_vtu(path, wanted) or {}
+        values = {n: values[n] for n in _chosen(wanted, values)}
+    return _Found(values, mesh=mesh.diagram if isinstance(mesh, Result) else mesh)
+
+
+def _of_openfoam(path: Path, wanted: tuple[str, ...] | None, time: float | None) -> _Found:
+    case = FoamCase(path if path.is_dir() else path.parent)
+    at = case.latest()
+    if time is not None:
+        there = case.times()
+        same = [one for one in there if one.value == time]
+        if not same:
+            raise FileError(f"it has no time {time:g}; it has {', '.join(one.name for one in there)}")
+        at = same[0]
+    foam = FoamMesh.read(case.mesh_folder(at))
+    known = {one.name: one for one in case.fields(at) if one.in_cells}
+    values = {}
+    for name in _chosen(wanted, known):
+        rows = known[name].internal.rows(foam.n_cells)
+        values[name] = rows[:, 0] if rows.shape[1] == 1 else rows
+    dim = 2 if foam.is_plane else 3
+    return _Found(values, foam.centroids[:, :dim], domain=_domain_of(foam))
+
+
+def _domain_of(foam: FoamMesh) -> Domain | None:
+    """Return the inside of the boundary; None if it cannot be one of clvoro."""
+    try:
+        return foam.domain()
+    except InputError:
+        return None
+
+
+def _of_table(path: Path, wanted: tuple[str, ...] | None, time: float | None) -> _Found:
+    _one_time(time)
+    with open_plain(path) as file:
+        lines = file.read().decode("utf-8-sig").splitlines()
+    lines = [line.lstrip("#% ") if k == 0 else line for k, line in enumerate(lines) if line.strip()]
+    if len(lines) < 2:
+        raise FileError(f"it has {len(lines)} lines, expected names in the first one, and rows of numbers")
+    mark = next((m for m in (",", ";", "\t") if m in lines[0]), None)
+    rows = list(csv.reader(lines, delimiter=mark)) if mark else [line.split() for line in lines]
+    names = [name.strip() for name in rows[0]]
+    try:
+        table = np.array([[float(item) for item in row] for row in rows[1:]])
+    except ValueError as error:
+        raise FileError(f"its rows are not numbers of one count ({error}), expected {len(names)} in each") from error
+    if table.ndim != 2 or table.shape[1] != len(names):
+        raise FileError(f"its rows have shape {table.shape}, expected {len(names)} numbers for the names in line 1")
+    return _of_columns(dict(zip(names, table.T, strict=True)), wanted)
+
+
+def _of_columns(columns: dict[str, np.ndarray], wanted: tuple[str, ...] | None) -> _Found:
+    """Return the values beside the columns x, y (, z) or lon, lat. ParaView writes Points:0 and U:0, U:1, U:2."""
+    split: dict[str, list[np.ndarray]] = {}
+    for name, column in columns.items():
+        base, sign, number = name.rpartition(":")
+        split.setdefault(base if sign and number.isdigit() else name, []).append(column)
+    values = {n: parts[0] if len(parts) == 1 else np.stack(parts, axis=1) for n, parts in split.items()}
+    if "Points" in values and values["Points"].ndim == 2:
+        places = values.pop("Points")
+        return _Found({n: values[n] for n in _chosen(wanted, values)}, places)
+    lower = {name.lower(): name for name in values}
+    for axes in _AXES:
+        along = [lower[axis] for axis in axes if axis in lower]
+        if len(along) >= 2 and all(values[n].ndim == 1 for n in along):
+            places = np.stack([values.pop(n) for n in along], axis=1)
+            return _Found({n: values[n] for n in _chosen(wanted, values)}, places, axes[0] != "x")
+    raise FileError(f"it has the columns {', '.join(columns):.300}, expected x, y (, z) or lon, lat among them")
+
+
+def _of_arrays(path: Path, wanted: tuple[str, ...] | None, time: float | None) -> _Found:
+    _one_time(time)
+    with open_plain(path) as file, zipfile.ZipFile(file) as archive:
+        names = [name.removesuffix(".npy") for name in archive.namelist()]
+    if "points" not in names:
+        raise FileError(f"it has the arrays {', '.join(names):.300}, expected points (n, d) among them")
+    places = read_array(path, "points").astype(float)
+    chosen = _chosen(wanted, [name for name in names if name != "points"])
+    return _Found({name: read_array(path, name).astype(float) for name in chosen}, places)
+
+
+def _of_netcdf(path: Path, wanted: tuple[str, ...] | None, time: float | None) -> _Found:
+    with open_netcdf(path) as file:
+        there = {name: found for name in file.names() if (found := _coordinates(file, name))}
+        axes = {name for axes, _, _ in there.values() for name in axes}
+        present = [name for name in there if name not in axes and file.is_real(name)]
+        values, used = {}, []
+        for name in _chosen(wanted, present):
+            names, along, on_globe = there[name]
+            values[name] = _at_time(file, name, along, time)
+            used.append((names, along, on_globe))
+        if len(set(used)) > 1:
+            raise FileError(f"its fields {', '.join(values)} are at different places; read them one after the other")
+        names, along, on_globe = used[0]
+        places = np.stack([file.data(name) for name in names], axis=1)
+        if names[0] == "lonCell":
+            places = np.degrees(places)
+    kept = ~np.any([np.isnan(v.reshape(len(v), -1)).any(axis=1) for v in values.values()], axis=0)
+    if not kept.any():
+        raise FileError(f"its fields {', '.join(values)} have no values")
+    return _Found({name: v[kept] for name, v in values.items()}, places[kept], on_globe)
+
+
+def _coordinates(file: Variables, name: str) -> tuple[tuple[str, ...], str, bool] | None:
+    """Return the coordinates of a variable, the dimension along them, and whether they are on a globe; else None."""
+    dims = file.dimensions(name)
+    if "nCells" in dims and "xCell" in file:
+        sphere = str(file.attribute("on_a_sphere")).strip().upper() == "YES"
+        return (("lonCell", "latCell") if sphere else ("xCell", "yCell")), "nCells", sphere
+    texts = [file.about(name, "coordinates")]
+    mesh = file.about(name, "mesh")
+    if mesh is not None and mesh in file:
+        texts.append(file.about(mesh, f"{file.about(name, 'location')}_coordinates"))
+    for text in texts:
+        known = tuple(one for one in str(text or "").split() if one in file and len(file.dimensions(one)) == 1)
+        along = {file.dimensions(one)[0] for one in known}
+        if len(along) == 1 and along <= set(dims):
+            lonlat = lonlat_names(file, " ".join(known))
+            if lonlat is not None:
+                return lonlat, along.pop(), True
+            if 2 <= len(known) <= 3:
+                return known, along.pop(), False
+    return None
+
+
+def _at_time(file: Variables, name: str, along: str, time: float | None) -> np.ndarray:
+    """Return a variable (n,) or (n, k) at a time, with levels as its components."""
+    dims, values = list(file.dimensions(name)), file.data(name)
+    for k, dim in enumerate(dims):
+        if dim.lower() == "time":
+            count, at = values.shape[k], -1 if time is None else time
+            if not (count and at == int(at) and -1 <= at < count):
+                raise FileError(f"{name} has {count} times, and time is {time}; expected 0 to {count - 1}")
+            values, dims = values.take(int(at), axis=k), dims[:k] + dims[k + 1 :]
+            break
+    else:
+        _one_time(time)
+    at = dims.index(along)
+    values = np.moveaxis(values, at, 0).reshape(values.shape[at], -1)
+    return values[:, 0] if values.shape[1] == 1 else values
+
+
+def _of_meshio(path: Path, wanted: tuple[str, ...] | None, time: float | None) -> _Found:
+    _one_time(time)
+    with open_plain(path):
+        pass
+    try:
+        import meshio
+    except ModuleNotFoundError as error:
+        raise FileError(
+            "it needs the package meshio: run `pip install 'clvoro[formats]'`, or write a table of points, .csv with "
+            "the columns x, y (, z)"
+        ) from error
+    try:
+        mesh = meshio.read(path)
+    except (Exception, SystemExit) as error:
+        raise FileError(
+            f"meshio cannot read it ({error!s:.200}); write a table of points, .csv with the columns x, y (, z), as "
+            "ParaView does with its filter Cell Centers"
+        ) from error
+    top = max((block.dim for block in mesh.cells), default=0)
+    blocks = [k for k, block in enumerate(mesh.cells) if block.dim == top]
+    in_cells = {name: [parts[k] for k in blocks] for name, parts in mesh.cell_data.items()}
+    there = [*in_cells, *(n for n in mesh.point_data if n not in in_cells)]
+    chosen = _chosen(wanted, there if wanted else in_cells or there)
+    if all(name in in_cells for name in chosen):
+        centers = np.concatenate([_centers(mesh.points, mesh.cells[k].data) for k in blocks])
+        return _Found({n: np.concatenate(in_cells[n]).astype(float) for n in chosen}, centers)
+    mixed = [name for name in chosen if name not in mesh.point_data]
+    if mixed:
+        raise FileError(f"{', '.join(mixed)} are in cells, the others at points; read them one after the other")
+    return _Found({name: np.asarray(mesh.point_data[name], float) for name in chosen}, mesh.points)
+
+
+def _centers(points: np.ndarray, cells: Sequence[Sequence[int]] | np.ndarray) -> np.ndarray:
+    """Return the mean of the corners of each cell."""
+    if isinstance(cells, np.ndarray):
+        return points[cells].mean(axis=1)
+    return np.array([points[np.asarray(cell)].mean(axis=0) for cell in cells])
+
+
+def _on_mesh(name: str, found: _Found, domain: Domain | None) -> tuple[Diagram, dict[str, np.ndarray]]:
+    """Return the mesh around the places of values inside the domain, and the values of its cells."""
+    if found.mesh is not None:
+        return found.mesh, found.values
+    domain = found.domain if domain is None else domain
+    if not isinstance(domain, Domain):
+        given = "none" if domain is None else f"a {type(domain).__name__}"
+        raise InputTypeError(f"domain is {given}, expected that to be adapted; give it, because {name} has none")
+    assert found.places is not None
+    if found.places.ndim != 2 or not np.isfinite(found.places).all():
+        raise InputError(f"{name} has points of shape {found.places.shape}, expected (n, {domain.dim}) finite numbers")
+    x = domain.placed(name, found.places, found.on_globe)
+    for key, rows in found.values.items():
+        if len(rows) != len(x):
+            raise InputError(f"{name}: {key} has {len(rows)} rows, expected {len(x)}: one for each point")
+    size = float(domain.extent.max())
+    on = domain.nearest(x)
+    near = np.linalg.norm(on - x, axis=1) < _NEAR_WALL * size
+    if near.sum() <= domain.dim:
+        low, high = x.min(axis=0).tolist(), x.max(axis=0).tolist()
+        raise InputError(
+            f"{name} has {len(x)} points from {low} to {high}, of which {near.sum()} are in {domain}, expected more "
+            f"than {domain.dim}; do units and the order of the coordinates agree?"
+        )
+    for text in coverage_warnings(name, domain, x[near].min(axis=0), x[near].max(axis=0), "give values everywhere"):
+        warnings.warn(text, MismatchWarning, stacklevel=3)
+    x = domain.wrap(on[near])
+    key = np.round((x - domain.lower) / (_SAME * size)).astype(np.int64)
+    _, first, cell = np.unique(key, axis=0, return_index=True, return_inverse=True)
+    cell, count = cell.ravel(), len(first)
+    share = 1 / np.bincount(cell, minlength=count)
+    values = {}
+    for one, rows in found.values.items():
+        columns = rows[near].reshape(len(x), -1)
+        if columns.shape[1] == domain.dim + 1 and not columns[:, -1].any():
+            columns = columns[:, :-1]  # VTK has vectors in space
+        mean = np.stack([np.bincount(cell, column, count) * share for column in columns.T], axis=1)
+        values[one] = mean[:, 0] if rows.ndim == 1 else mean
+    mesh = voronoi(domain, x[first])
+    if mesh.home is not None:  # some cells of solids have several parts
+        rows_of = np.where(mesh.home < 0, -1 - mesh.home, mesh.home)
+        values = {one: rows[rows_of] for one, rows in values.items()}
+    return mesh.with_arrays(centroids=mesh.points), values
