@@ -41,6 +41,8 @@ class Effort:
         holds for all coarser levels.
     alone : int
         Sweeps if there are no coarser levels; in 3D, steps of gliding before the last ones.
+    start_alone : int
+        The most of the steps `start` if there are no coarser levels, in 2D.
     glide : int
         Steps of a sweep.
     polish : int
@@ -100,6 +102,7 @@ class Effort:
     nuclei: float = 0.0
     first: int = 99
     alone: int = 0
+    start_alone: int = 99
     bad_cell_weight: float = 20.0
     quality_scale: float = 0.03
     log_ratio_scale: float = 12.0
@@ -139,7 +142,8 @@ EFFORTS = {
         5,
         3,
         (4, 20, 6, 3),
-        alone=20,
+        alone=12,
+        start_alone=12,
         glide=7,
         polish=21,
         error_target=0.0025,

@@ -205,7 +205,7 @@ def _adaptive_2d(effort: Effort, levels: int, exact: bool, error_target: float, 
         elif warm:
             couple = effort.couple_finest
         else:
-            couple = effort.start
+            couple = effort.start if levels else min(effort.start, effort.start_alone)
         yield from [Step(COUPLE if level < levels else start)] * couple
         yield CorrectCount(COUNT_SHARE)
         sweeps = effort.sweeps[min(level, len(effort.sweeps) - 1)]
