@@ -156,8 +156,6 @@ class _WallMaker:
         Whether a part of the face lies inside.
     crossed : (f, 2) float64
         Position on the boundary where the face ends, for both ends; nan for an end in a vertex.
-    left : (f, 2) float64
-        Position where a face that is taken as whole leaves the domain before its end; nan for others.
     ends : (f, 2) int
         Points of the faces that are kept.
     points : (p, 2) float64
@@ -246,8 +244,6 @@ class _WallMaker:
         gap = BEHIND_WALL * margin
         whole = from_begin & on[:, 1] & (high[last] >= 1 - gap)
         whole |= ~from_begin & from_end & on[:, 0] & (low[first] <= gap)
-        self.left = np.full((len(begin), 2), np.nan)
-        self.left[cut] = np.where(whole[:, None], np.column_stack([parts[last, 2], parts[first, 3]]), np.nan)
         part[whole] = 0, 1, np.nan, np.nan
         self.kept[cut] = seen & (~on.any(axis=1) | (part[:, 1] - part[:, 0] >= gap))
         # From a filled vertex on land nothing is kept of a face that leads outward.
@@ -310,12 +306,7 @@ class _WallMaker:
         ends[is_crossing] = count + np.arange(crossings)
         row, side = np.nonzero(on)
         at, face = vertex[row, side], kept[row]
-        feet, faced = self._feet(
-            f.vertices[at], self._ahead_of(at, vertex[row, 1 - side], face), ON_WALL * self.least[at]
-        )
-        # A face that comes to the back of a wall ends on its front.
-        front = self.left[face, side]
-        feet = np.where(faced | np.isnan(front), feet, front)
+        feet = self._feet(f.vertices[at], ON_WALL * self.least[at])
         # Two faces end in one point if a cell lies between them, and they come to the same side of the wall.
         cells = np.concatenate([f.left[face], f.right[face]]).astype(np.int64)
         key, of_end = np.tile(at, 2) * n + cells, np.tile(np.arange(len(at)), 2)
@@ -332,34 +323,23 @@ class _WallMaker:
         self.ends = np.full((len(self.kept), 2), -1)
         self.ends[kept] = ends
 
-    def _ahead_of(self, vertex: np.ndarray, other: np.ndarray, face: np.ndarray) -> np.ndarray:
-        """Return points on faces before they reach `vertex`, half a width of their cells away, (k, 2)."""
-        x = self.convex.vertices[vertex]
-        way = self.convex.vertices[other] - x
-        length = np.maximum(np.hypot(*way.T), 1e-300)
-        return x + np.minimum(1, self.width[face] / 2 / length)[:, None] * way
-
     def _are_near(self, s: np.ndarray, t: np.ndarray, reach: np.ndarray) -> np.ndarray:
         """Return whether positions on the boundary are on one ring and not farther apart than `reach`, (k,) bool."""
         ring, gap = self.along.ring_of(s), np.abs(s - t)
         total = np.diff(self.along.begins[self.along.ring_starts])[ring]
         return (ring == self.along.ring_of(t)) & (np.minimum(gap, total - gap) <= reach)
 
-    def _feet(self, points: np.ndarray, sights: np.ndarray, reach: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return positions within `reach` of `points` (k, 2): re-entrant corners, else on edges that face `sights`.
-
-        Also return whether there is such a corner or edge, (k,) bool. If not, the position is on another one.
-        """
+    def _feet(self, points: np.ndarray, reach: np.ndarray) -> np.ndarray:
+        """Return positions within `reach` of `points` (k, 2): re-entrant corners, else the nearest."""
         row, edge = self.domain.edges_within(points, 1.001 * reach)
         begin, way = self.rings.vertices[edge], self.rings.along[edge]
         share = np.clip(((points[row] - begin) * way).sum(axis=1) / self.rings.lengths[edge] ** 2, 0, 1)
         at_corner = (self.rings.turns[edge] < -WALL_CORNER) & (np.hypot(*(begin - points[row]).T) <= reach[row])
         share[at_corner] = 0
         off = np.hypot(*(begin + share[:, None] * way - points[row]).T)
-        faces_away = cross(way, sights[row] - begin) <= 0
-        order = np.lexsort((off, faces_away, ~at_corner, row))
+        order = np.lexsort((off, ~at_corner, row))
         order = order[np.diff(row[order], prepend=-1) > 0]
-        return self.along.position(edge[order], share[order]), (at_corner | ~faces_away)[order]
+        return self.along.position(edge[order], share[order])
 
     def move_into_corners(self) -> None:
         """Move the nearest face end on the boundary into each convex corner and each end of a named part."""
