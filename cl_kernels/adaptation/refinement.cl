@@ -3,12 +3,13 @@
    gets one new generator between its generator and the wall, or behind its generator if that is almost on the wall. One
    work-item per generator. */
 #include "adaptation/separation.h"
+#include "adaptation/site_key.h"
 
-/* Whether the edge from i to j gets a new generator. Each edge is counted at its lower index. */
-inline bool has_midpoint(int i, int j, REAL measure, REAL volume)
+/* Whether the edge from generator `name` to `other` gets a new generator. Each edge is counted at its lower name. */
+inline bool has_midpoint(int name, int other, REAL measure, REAL volume)
 {
     const REAL length = CELL_DIM == 2 ? sqrt(volume) : cbrt(volume);
-    return j > i && measure > R(SHORT_FACE) * (CELL_DIM == 2 ? length : length * length);
+    return other > name && measure > R(SHORT_FACE) * (CELL_DIM == 2 ? length : length * length);
 }
 
 /* Whether an end of the edge is fixed (label below `fixed`): such edges get no new generators. */
@@ -61,7 +62,7 @@ inline REAL free_depth(int i, REAL most, REAL gap, const REAL *n, global const i
 /* counts[i] = number of new generators at cell i. */
 kernel void count_new_generators(const int size, global const int *starts, global const int *neighbors,
                                  global const FACE *face_measures, global const REAL *volumes, global const int *labels,
-                                 const int fixed, global int *counts)
+                                 const int fixed, NAME_ARGS, global int *counts)
 {
     WORK_ITEM(i);
     int count = 0;
@@ -70,7 +71,7 @@ kernel void count_new_generators(const int size, global const int *starts, globa
         if (is_fixed(i, j, labels, fixed))
             continue;
         count += j < 0 ? is_wall_side(k, starts[i], starts[i + 1], neighbors, face_measures, volumes[i])
-                       : has_midpoint(i, j, face_measures[k], volumes[i]);
+                       : has_midpoint(NAME(i), NAME(j), face_measures[k], volumes[i]);
     }
     counts[i] = count;
 }
@@ -79,7 +80,7 @@ kernel void count_new_generators(const int size, global const int *starts, globa
    sums of the counts; h is the size on the new level. */
 kernel void place_new_generators(const int size, global const int *starts, global const int *neighbors,
                                  global const FACE *face_measures, global const REAL *volumes,
-                                 global const REAL *points, global const int *labels, const int fixed,
+                                 global const REAL *points, global const int *labels, const int fixed, NAME_ARGS,
                                  global const REAL *h, const int n, DOMAIN_ARGS, global const int *child_starts,
                                  global REAL *finer, global const FACE *face_centroids OUTLINE_ARGS)
 {
@@ -137,7 +138,7 @@ kernel void place_new_generators(const int size, global const int *starts, globa
             const REAL way = gap > most / 8 || room < 3 * gap ? fmin(gap / 2, h[i] / 4) : room / 2;
             child[axis] = level + (wall % 2 ? -way : way);
 #endif
-        } else if (has_midpoint(i, j, face_measures[k], volumes[i])) {
+        } else if (has_midpoint(NAME(i), NAME(j), face_measures[k], volumes[i])) {
 #ifdef SPHERE
             REAL middle[3];
             EACH_AXIS (a)

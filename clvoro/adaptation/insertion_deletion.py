@@ -204,7 +204,7 @@ class InsertionDeletion:
         self._labels, self._fixed = generators.labels, fixed
         keys = self._keys(t)
         deficit = engine.real.type(deficit)
-        engine.run_each(k.score_bad_cells, n, t.starts, t.neighbors, quality, deficit, *self._names(t), keys)
+        engine.run_each(k.score_bad_cells, n, t.starts, t.neighbors, quality, deficit, *t.name_args, keys)
         self._drop_fixed(t, keys, neighbors=True)
         chosen = self._choose(t, keys, PAIR_RINGS)
         self._limit(t, chosen, most)
@@ -264,11 +264,6 @@ class InsertionDeletion:
             t.forward(engine, mean)
         return kinds, once, raw
 
-    def _names(self, t: Tessellation) -> tuple[object, ...]:
-        """Return NAME_ARGS: labels, if there are other parts."""
-        labels = None if t.part is None else t.part.labels
-        return (np.int32(0), t.starts) if labels is None else (np.int32(1), labels)
-
     def _keys(self, t: Tessellation) -> cla.Array:
         """Return the array for keys of all rows."""
         return self._room("keys", size=t.rows, dtype=np.uint64)
@@ -284,7 +279,7 @@ class InsertionDeletion:
     def _nucleate(self, t: Tessellation, kinds: cla.Array, strain: cla.Array, marks: _Marks, nuclei: int) -> None:
         """Mark at most `nuclei` insertions and as many mergers where the perfect lattice is strained most."""
         engine, k, n = self.engine, self._kernels, t.n
-        keys, names, limit = self._keys(t), self._names(t), engine.real.type(NUCLEATION_STRAIN)
+        keys, names, limit = self._keys(t), t.name_args, engine.real.type(NUCLEATION_STRAIN)
         engine.run_each(k.score_strain, n, t.starts, t.neighbors, kinds, strain, limit, *names, keys)
         self._drop_fixed(t, keys, neighbors=True)
         chosen = self._choose(t, keys, NUCLEUS_RINGS)
@@ -332,7 +327,7 @@ class InsertionDeletion:
         engine, k, n = self.engine, self._kernels, t.n
         real, strain_limit = engine.real.type, engine.real.type(change.climb_strain)
         partners = self._room("partners", size=4 * t.rows, dtype=np.int32).reshape(-1, 4)
-        pull, keys, names = self._room("pull", size=t.rows), self._keys(t), self._names(t)
+        pull, keys, names = self._room("pull", size=t.rows), self._keys(t), t.name_args
         engine.run_each(
             k.score_pairs,
             n,
@@ -385,7 +380,7 @@ class InsertionDeletion:
         """Mark about `rest` of the largest cells to split, or -rest of the smallest to delete, relative to h."""
         engine, k, n = self.engine, self._kernels, t.n
         sign, keys = engine.real.type(math.copysign(1, rest)), self._keys(t)
-        engine.run_each(k.score_log_ratio, n, t.starts, t.neighbors, log_ratio, sign, *self._names(t), keys)
+        engine.run_each(k.score_log_ratio, n, t.starts, t.neighbors, log_ratio, sign, *t.name_args, keys)
         self._drop_fixed(t, keys, neighbors=False)
         engine.run_each(k.drop_sites, n, self.spread(t, marks.busy, LOG_RATIO_RINGS), keys)
         chosen = self._choose(t, keys, LOG_RATIO_RINGS)

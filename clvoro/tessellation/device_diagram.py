@@ -208,6 +208,12 @@ class Tessellation:
         return extended
 
     @property
+    def name_args(self) -> tuple[object, ...]:
+        """The NAME_ARGS of kernels (adaptation/site_key.h): the labels of a part."""
+        labels = None if self.part is None else self.part.labels
+        return (np.int32(0), self.starts) if labels is None else (np.int32(1), labels)
+
+    @property
     def is_power(self) -> bool:
         """Whether it is a power diagram."""
         return self.sites.shape[1] > self.points.shape[1]

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import scipy
 
 from clvoro.adaptation.insertion_deletion import CellSizes, Change, Generators
 from clvoro.adaptation.stages import Stages
@@ -248,6 +249,27 @@ def test_a_projected_step_in_two_halves(ctx, dim, real):
     limits = (1e3 * np.finfo(real).eps, 1e-4)  # derivatives are in single precision
     for name, limit, expected, *found in zip(("ways", "moves"), limits, one, *two, strict=False):
         assert np.abs(halves.joined(found) - expected).max() < limit * np.abs(expected).max(), name
+
+
+@pytest.mark.sparse(2)
+@pytest.mark.parametrize("real", REALS)
+def test_refinement_of_two_halves(ctx, dim, real):
+    """Each edge between the halves gets one new generator, from the cell of the lower label."""
+    halves = Halves(ctx, dim, real)
+    h = (halves.box.measure / halves.n) ** (1 / dim) / 2
+
+    def work(stages, part, rows):
+        t, own = tessellate(stages, part), rows[: part.n_own]
+        labels = stages.engine.upload(halves.labels[own], np.int32)
+        with stages.engine.workspace.frame():
+            finer = stages.refinement.refine(halves.box, t, stages.engine.zeros(t.n).fill(h), labels, fixed=30)
+        return finer.get()[t.n :]
+
+    one, two = halves.run(work)
+    both = np.concatenate(two)
+    assert len(both) == len(one) > 2 * halves.n
+    gaps, _ = scipy.spatial.KDTree(both).query(one)
+    assert gaps.max() < 1e3 * np.finfo(real).eps
 
 
 @pytest.mark.sparse(4)
