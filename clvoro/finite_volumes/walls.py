@@ -306,7 +306,8 @@ class _WallMaker:
         ends[is_crossing] = count + np.arange(crossings)
         row, side = np.nonzero(on)
         at, face = vertex[row, side], kept[row]
-        feet = self._feet(f.vertices[at], ON_WALL * self.least[at])
+        sights = self._ahead_of(at, vertex[row, 1 - side], face)
+        feet = self._feet(f.vertices[at], sights, ON_WALL * self.least[at])
         # Two faces end in one point if a cell lies between them, and they come to the same side of the wall.
         cells = np.concatenate([f.left[face], f.right[face]]).astype(np.int64)
         key, of_end = np.tile(at, 2) * n + cells, np.tile(np.arange(len(at)), 2)
@@ -323,21 +324,29 @@ class _WallMaker:
         self.ends = np.full((len(self.kept), 2), -1)
         self.ends[kept] = ends
 
+    def _ahead_of(self, vertex: np.ndarray, other: np.ndarray, face: np.ndarray) -> np.ndarray:
+        """Return points on faces before they reach `vertex`, half a width of their cells away, (k, 2)."""
+        x = self.convex.vertices[vertex]
+        way = self.convex.vertices[other] - x
+        length = np.maximum(np.hypot(*way.T), 1e-300)
+        return x + np.minimum(1, self.width[face] / 2 / length)[:, None] * way
+
     def _are_near(self, s: np.ndarray, t: np.ndarray, reach: np.ndarray) -> np.ndarray:
         """Return whether positions on the boundary are on one ring and not farther apart than `reach`, (k,) bool."""
         ring, gap = self.along.ring_of(s), np.abs(s - t)
         total = np.diff(self.along.begins[self.along.ring_starts])[ring]
         return (ring == self.along.ring_of(t)) & (np.minimum(gap, total - gap) <= reach)
 
-    def _feet(self, points: np.ndarray, reach: np.ndarray) -> np.ndarray:
-        """Return positions within `reach` of `points` (k, 2): re-entrant corners, else the nearest."""
+    def _feet(self, points: np.ndarray, sights: np.ndarray, reach: np.ndarray) -> np.ndarray:
+        """Return positions within `reach` of `points` (k, 2): re-entrant corners, edges that face `sights`, others."""
         row, edge = self.domain.edges_within(points, 1.001 * reach)
         begin, way = self.rings.vertices[edge], self.rings.along[edge]
         share = np.clip(((points[row] - begin) * way).sum(axis=1) / self.rings.lengths[edge] ** 2, 0, 1)
         at_corner = (self.rings.turns[edge] < -WALL_CORNER) & (np.hypot(*(begin - points[row]).T) <= reach[row])
         share[at_corner] = 0
         off = np.hypot(*(begin + share[:, None] * way - points[row]).T)
-        order = np.lexsort((off, ~at_corner, row))
+        faces_away = cross(way, sights[row] - begin) <= 0
+        order = np.lexsort((off, faces_away, ~at_corner, row))
         order = order[np.diff(row[order], prepend=-1) > 0]
         return self.along.position(edge[order], share[order])
 
