@@ -249,3 +249,10 @@ def test_rings_of_many_edges_are_closed(ctx):
     onward = along_rings(diagram, domain)
     walls = np.flatnonzero(diagram.neighbors < 0)
     np.testing.assert_array_equal(np.sort(onward[walls]), walls)
+
+
+def test_the_two_sides_of_a_thin_wall_keep_their_cells_apart(ctx):
+    """Faces end on the side that their cells see, so that nothing is lost."""
+    square = clvoro.Polygon([(0, 0), (0.995, 0), (1, 1), (1.005, 0), (2, 0), (2, 2), (0, 2)])
+    mesh = clvoro.Adapter(ctx).run(square, 0.15, "fast").solver_mesh()
+    assert mesh.area_change == 0
