@@ -87,7 +87,8 @@ class FieldSizes:
         Patches whose forces are the goal: cells near them count more (`force_weight`).
     adjoints : sequence of str
         Adjoint velocities among the case's fields, such as "Ua" of ``adjointOptimisationFoam``, one for each goal:
-        cells count by the gradient of these (`steepness`).
+        cells count by the gradient of these (`steepness`), the largest one. They have one unit, that of the goals: of
+        coefficients of forces, errors of .001 in each count alike. A goal counts more by the weight of its objective.
     p : float, optional
         As for `hessian_size`. By default 2, and 1 for a goal.
     h_min, h_max, growth : float
@@ -120,7 +121,7 @@ class FieldSizes:
         if self.forces:
             weight = force_weight(self.forces, on)
         elif self.adjoints:
-            weight = steepness([found[name] for name in self.adjoints], on)
+            weight = np.maximum.reduce([steepness(found[name], on) for name in self.adjoints])
         p = self.p or (2.0 if weight is None else 1.0)
         bounds: dict[str, Any] = {"p": p, "h_min": self.h_min, "h_max": self.h_max, "growth": self.growth}
         return hessian_size([found[f] for f in self.fields], on=on, n_cells=n_cells, weight=weight, **bounds)
@@ -242,6 +243,7 @@ class _Loop:
     pictures: bool
     adapter: Adapter
     rows: list[FoamCycle] = field(default_factory=list)
+    read: dict[Path, FoamMesh] = field(default_factory=dict)
 
     def run(
         self,
@@ -272,6 +274,12 @@ class _Loop:
                 on_cycle(known)
                 return self.rows
             on_cycle(self._adapt(known, note, mesh))
+
+    def _mesh_in(self, folder: Path) -> FoamMesh:
+        """Return the mesh in a folder; it is read once."""
+        if folder not in self.read:
+            self.read = {folder: FoamMesh.read(folder)}
+        return self.read[folder]
 
     def _known(self, note: dict[str, Any]) -> FoamCycle | None:
         """Return the row of the latest solution; None if it is not in the report."""
@@ -331,7 +339,7 @@ class _Loop:
         """Return the row of the latest solution, and add it to the report."""
         case = self.case
         latest = case.latest()
-        cells = FoamMesh.read(case.mesh_folder(latest)).n_cells
+        cells = self._mesh_in(case.mesh_folder(latest)).n_cells
         row = FoamCycle(note["cycle"], latest.value, cells, case.monitors(), seconds)
         if seconds:
             self._keep(row)
@@ -346,7 +354,7 @@ class _Loop:
         case, latest = self.case, self.case.latest()
         start = time.perf_counter()
         folder = case.mesh_folder(latest)
-        foam = FoamMesh.read(folder)
+        foam = self._mesh_in(folder)
         old = MeshOfCase.of(foam, self._diagram(folder, foam, mesh if note["cycle"] == 0 else None))
         fields = case.fields(latest)
         _check_values(fields, foam)
@@ -394,6 +402,7 @@ class _Loop:
         known = {"cycle": row.cycle + 1, "time": latest.value, "layers": described, "row": asdict(done)}
         (target / "polyMesh" / _NOTE).write_text(json.dumps(known))
         case.put_time(latest.name, target)
+        self.read = {case.folder / latest.name / "polyMesh": new.foam}
         self._keep(done)
         return done
 

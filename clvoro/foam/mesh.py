@@ -61,8 +61,16 @@ class FoamMesh:
             if not any(len(patch.faces) for patch in patches if patch.kind != "empty"):
                 raise FileError("its boundary has no patch with faces, expected walls, inlets, ...")
             n_cells = count_cells(points, starts, corners, owner, neighbor)
-            if any(len(patch.faces) and patch.faces[-1] >= len(owner) for patch in patches):
-                raise FileError("its boundary has faces that are not there, expected those of the mesh")
+            listed = np.sort(np.concatenate([patch.faces for patch in patches]))
+            if not np.array_equal(listed, np.arange(len(neighbor), len(owner))):
+                raise FileError(
+                    f"its patches have {len(listed)} faces, the boundary {len(owner) - len(neighbor)}, expected each of "
+                    "them in one patch"
+                )
+            names = [patch.name for patch in patches]
+            twice = [name for name in names if names.count(name) > 1]
+            if twice:
+                raise FileError(f"it has two patches {twice[0]}, expected one for each name")
             return cls(points, starts, corners, owner, neighbor, patches, n_cells)
 
     @cached_property

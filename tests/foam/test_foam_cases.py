@@ -407,6 +407,13 @@ def nan_in_row_3(values):
         (lambda c: close(c, "outlet"), {}, InputError, "U enters the domain with .* and leaves it with 0"),
         (lambda c: spoil(c, "5/p", b"internalField", b"otherField"), {}, InputError, "p has no internalField"),
         (lambda c: (c / "5" / "log").write_text("no field"), {}, InputError, "move other files"),
+        (lambda c: spoil(c, "constant/polyMesh/boundary", b"outlet", b"walls"), {}, InputError, "two patches walls"),
+        (
+            lambda c: spoil(c, "constant/polyMesh/boundary", b"nFaces          8", b"nFaces          7"),
+            {},
+            InputError,
+            "expected each of them in one patch",
+        ),
         (lambda c: change_owner(c, 5), {}, InputError, "its lists do not fit each other"),
     ],
 )
