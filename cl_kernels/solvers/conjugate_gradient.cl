@@ -63,13 +63,14 @@ kernel void sum_right_sides(int n, int from_zero, global const REAL *b, global c
     add_right_sides(n, from_zero, b, w, partial, group);
 }
 
-/* r = 2^e (r - mean r) with `center`, else r = 2^e r; p = 0; x = 0 with `from_zero`. NORM_B, NORM_R = |b|^2, |r|^2
-   after the same scaling and centering. state[1] = 2^-e, state[2] = the part of |b|^2 that centering has removed. */
+/* r = 2^e (r - mean r) with `center`, the number of unknowns of all parts; if it is 0, r = 2^e r; p = 0; x = 0 with
+   `from_zero`. NORM_B, NORM_R = |b|^2, |r|^2 after the same scaling and centering. state[1] = 2^-e, state[2] = the part
+   of |b|^2 that centering has removed. */
 inline void set_residual(int n, int from_zero, int center, global const REAL *b, global const STORE *w, global REAL *x,
                          global STORE *r, global STORE *p, global REAL *partial, global REAL *state, group_t group)
 {
-    const REAL mean_b = center ? total_sum(ROW(SUM_B), group) / n : 0;
-    const REAL mean_r = center ? total_sum(ROW(START), group) / n : 0;
+    const REAL mean_b = center ? total_sum(ROW(SUM_B), group) / center : 0;
+    const REAL mean_r = center ? total_sum(ROW(START), group) / center : 0;
     const REAL max_b = total_max(ROW(MAX_B), group);
     const int exponent = max_b > 0 && max_b <= REAL_MAX ? clamp(-ilogb(max_b), -EXPONENT_LIMIT, EXPONENT_LIMIT) : 0;
     Sum norm_b = SUM_ZERO, norm_r = SUM_ZERO, sum_r = SUM_ZERO, sum_x = SUM_ZERO;
@@ -92,7 +93,7 @@ inline void set_residual(int n, int from_zero, int center, global const REAL *b,
     if (IS_FIRST_ITEM) {
         const REAL taken = ldexp(mean_b, exponent);
         state[1] = ldexp(R(1), -exponent);
-        state[2] = n * taken * taken;
+        state[2] = center * taken * taken;
     }
 }
 
@@ -236,7 +237,7 @@ inline Step step_length(int k, int n, int center, global const REAL *partial, gl
     s.end = running && curvature > 0 ? n : 0;
     s.alpha = now[RECORD_GAMMA] / curvature;
     s.alpha_x = s.alpha * state[1];
-    s.mean = center ? total_sum(ROW(SUM_R(k)), group) / n : 0;
+    s.mean = center ? total_sum(ROW(SUM_R(k)), group) / center : 0;
     return s;
 }
 
@@ -324,10 +325,10 @@ kernel void update_solution_jacobi(global int *counts, int n, int center, global
 }
 
 /* x -= mean x. */
-kernel void center_solution(int n, global REAL *x, global const REAL *partial)
+kernel void center_solution(int n, int center, global REAL *x, global const REAL *partial)
 {
     LONG_GROUP;
-    const REAL mean = total_sum(ROW(SUM_X), group) / n;
+    const REAL mean = total_sum(ROW(SUM_X), group) / center;
     for (GROUP_LOOP(i, n))
         x[i] -= mean;
 }

@@ -17,6 +17,7 @@ from .linear_system import BreakdownError, Limits, Operator, Precondition, Solut
 
 # Rows of the partial sums (as in conjugate_gradient.cl) and columns of the record (as in partial_sums.h).
 CURVATURE, _GAMMA, _ROWS = 3, 6, 12
+_SUM_B, _MAX_B, _NORM_B, _NORM_R, _SUM_R, _START, _SUM_X = 0, 1, 2, 4, 8, 10, 11
 RECORD_NORM, RECORD_RUNNING, RECORD_CURVATURE = 0, 2, 3
 _STATE = 8
 _FIRST_READ = 32
@@ -157,7 +158,7 @@ class ConjugateGradient:
         vectors = (engine.scratch(len(rhs), store) for _ in range(4))
         assert operator.rows is not None
         given = (*operator.rows, inverse_diagonal, rhs, x, *vectors, self.partial, self._group_state)
-        size, center = np.int32(len(rhs)), np.int32(operator.singular)
+        size, center = np.int32(len(rhs)), np.int32(len(rhs) if operator.singular else 0)
         kernel = self.kernels_in(store).solve_by_group
         done, history, stagnated = 0, [], math.inf
         while True:
@@ -287,11 +288,14 @@ class _Iteration:
         self._kernels = k = solver.kernels_in(store)
         scratch = self._engine.scratch
         self._r, self._u, self._q = (scratch(n, store) for _ in range(3))
-        self._p = scratch(n, store)
+        part, all_n = operator.part, n
+        if part is not None:
+            all_n = int(part.total(np.array(n)))
+        self._p = scratch(n if part is None else part.count, store)
         # On CPUs it costs more to evaluate directions of neighbors again than to store them.
         self._merged = operator.rows is not None and self._engine.group_size > 1
         directions = (self._p, scratch(n, store)) if self._merged else (self._p, self._p)
-        self._size, self._center = np.int32(n), np.int32(operator.singular)
+        self._size, self._center = np.int32(n), np.int32(all_n if operator.singular else 0)
         # The recurrence stops slightly below the tolerance, so that the true residual is within it.
         limit = self._engine.real.type(0.95 * tolerance)
         self._tail = (solver.partial, solver.state, solver.record)
@@ -322,10 +326,12 @@ class _Iteration:
     def start(self, from_zero: bool) -> None:
         """Set r to the true residual, of x or of zero."""
         if not from_zero:
-            self._operator.apply(self._x, self._q)
+            part = self._operator.part
+            self._operator.apply(self._x if part is None else part.with_ghosts(self._engine, self._x), self._q)
         k, anew = self._kernels, np.int32(from_zero)
         partial, state, _ = self._tail
         self._launch(k.sum_right_sides, self._size, anew, self._rhs, self._q, partial)
+        self._sum_over_parts(_SUM_B, _START, _MAX_B)
         self._launch(
             k.start_residual,
             self._size,
@@ -340,6 +346,7 @@ class _Iteration:
             state,
             self._solver.counts,
         )
+        self._sum_over_parts(_NORM_B, _NORM_R, _SUM_R)
 
     def begin(self) -> None:
         """Precondition the first residual."""
@@ -347,6 +354,7 @@ class _Iteration:
             self._launch(
                 self._kernels.precondition_jacobi, self._size, self._precondition, self._r, self._u, self._tail[0]
             )
+            self._sum_over_parts(_GAMMA)
 
     def iterate(self, k: int) -> None:
         """Enqueue iteration k."""
@@ -356,10 +364,14 @@ class _Iteration:
         direction, solution = self._find_direction[k & 1], self._update_solution[k & 1]
         direction()
         if not self._merged:
+            if self._operator.part is not None:
+                self._operator.part.forward(self._engine, self._p)
             self._operator.apply(self._p, self._q)
             if not self._operator.writes_curvature:
                 self._dot_product(CURVATURE, self._p, self._q)
+            self._sum_over_parts(CURVATURE)
         solution()
+        self._sum_over_parts(*(row + (k + 1) % 2 for row in (_NORM_R, _SUM_R, _GAMMA)))
 
     def record_norm(self) -> None:
         """Record the residual before the next iteration, and whether it is needed."""
@@ -368,7 +380,20 @@ class _Iteration:
 
     def center(self) -> None:
         """Subtract its mean from x."""
-        self._launch(self._kernels.center_solution, self._size, self._x, self._tail[0])
+        self._sum_over_parts(_SUM_X)
+        self._launch(self._kernels.center_solution, self._size, self._center, self._x, self._tail[0])
+
+    def _sum_over_parts(self, *rows: int) -> None:
+        """Replace these rows of the partial sums by their sums over all parts, and the maximum by the largest."""
+        part = self._operator.part
+        if part is None or part.peers is None:
+            return
+        partial = self._tail[0].get().reshape(_ROWS, -1)
+        found = np.stack(part.peers.gather(partial[list(rows)]))
+        partial[list(rows)] = found.sum(axis=0)
+        if _MAX_B in rows:
+            partial[_MAX_B] = found[:, rows.index(_MAX_B)].max(axis=0)
+        self._tail[0].set(partial.ravel())
 
     def _dot_product(self, row: int, a: cla.Array, b: cla.Array) -> None:
         self._launch(self._kernels.dot_product, self._size, np.int32(row), a, b, self._tail[0])

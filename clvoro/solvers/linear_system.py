@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pyopencl.array as cla
 
 from ..errors import SolverError
+
+if TYPE_CHECKING:
+    from ..tessellation.part import Part
 
 Apply = Callable[[cla.Array, cla.Array], object]
 Precondition = Callable[[cla.Array, cla.Array, cla.Array], object]
@@ -101,12 +104,16 @@ class Operator:
     rows : tuple of device arrays, optional
         Starts, columns and weights of A, if it is a matrix (see solvers/sparse_rows.h). One work-group then solves
         systems of few unknowns, if the preconditioner is diagonal. On GPUs an iteration takes a launch less.
+    part : Part, optional
+        If there are other parts, which solve with this one: x then has rows for ghosts, whose values are known when
+        `apply` is called, and sums are those of all parts.
     """
 
     apply: Apply
     writes_curvature: bool = False
     singular: bool = False
     rows: tuple[cla.Array, ...] | None = None
+    part: Part | None = None
 
 
 @dataclass(frozen=True)

@@ -73,11 +73,14 @@ class Laplacian:
         Neighbors of the diagram, owners in place of ghosts: walls are negative.
     weights : (m,) real or float32
         w_ij = rho_ij l_ij / d_ij; 0 at walls.
+    part : Part, optional
+        If neighbors are ghosts whose owners are in other parts.
     """
 
     starts: cla.Array
     neighbors: cla.Array
     weights: cla.Array
+    part: Part | None = None
 
     def __len__(self) -> int:
         return len(self.starts) - 1
@@ -161,7 +164,7 @@ class Poisson:
             Tolerance of the solves to come. From `SINGLE_PRECISION_TOLERANCE` on weights and vectors are in float32.
         part : Part, optional
             The part whose rows `neighbors` names, if it has ghosts. Those with an owner in it are replaced by this one.
-            If others have owners elsewhere, `apply` takes x with their values, and `solve` is not for such a matrix.
+            If owners are in other parts, `apply` takes x with their values, and all parts call `solve` together.
 
         Returns
         -------
@@ -196,7 +199,7 @@ class Poisson:
             *self.engine.period_args,
         )
         columns = neighbors if part is None else part.name_owners(engine, starts, neighbors)
-        return Laplacian(starts, columns, weights)
+        return Laplacian(starts, columns, weights, None if part is None or part.peers is None else part)
 
     def inverse_diagonal(self, laplacian: Laplacian) -> cla.Array:
         """Return the inverse row sums of the weights (n,), 0 for a sum of 0, in the workspace."""
@@ -283,7 +286,7 @@ class Poisson:
             the cheaper one by `expected_costs`: on CPUs, at tolerances of 1e-8 and 1e-2, multigrid from about 2000 and
             3400 cells on in 2D, from 18,000 and 56,000 in 3D. If multigrid breaks down, stagnates early, or does not
             converge in 200 iterations without `max_iterations`, Jacobi's preconditioner continues; `Solution.reason`
-            says so.
+            says so. With other parts it is "jacobi".
         ordering : object, optional
             The same object as in an earlier call states that the cells are the same, in the same order, and have moved
             little. The coarse levels of the multigrid are then reused.
@@ -303,15 +306,18 @@ class Poisson:
         SolverError
             If a number is not finite, or the iteration breaks down with Jacobi's preconditioner.
         """
-        n = len(laplacian)
+        n, part = len(laplacian), laplacian.part
         _check("rhs", rhs, (n,))
         _check("potential", potential, (n,))
         if preconditioner not in _PRECONDITIONERS:
             raise InputError(f"preconditioner got {preconditioner!r}, expected one of {_PRECONDITIONERS}")
         if not tolerance > 0:
             raise InputError(f"tolerance got {tolerance!r}, expected a number > 0, such as 1e-8")
-        operator = Operator(self._apply_of(laplacian), writes_curvature=True, singular=True, rows=laplacian.rows)
+        rows = laplacian.rows if part is None else None
+        operator = Operator(self._apply_of(laplacian), writes_curvature=True, singular=True, rows=rows, part=part)
         system = _Equation(laplacian, operator, rhs, potential, tolerance)
+        if part is not None:
+            preconditioner, n = "jacobi", int(part.total(np.array(n)))
         if preconditioner == "auto":
             one_group = n <= one_group_limit(self.engine)
             factors = cost_factors(self.engine.queue.device)

@@ -7,13 +7,11 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
-import pyopencl as cl
 import pyopencl.array as cla
 import scipy
 
 from ..errors import InputError
 from ..geometry.sphere import directions, farthest_place
-from ..opencl.device_array import buffer_of
 
 if TYPE_CHECKING:
     from ..geometry.domain import Domain
@@ -200,12 +198,7 @@ class Tessellation:
 
     def with_ghosts(self, engine: Engine, values: cla.Array) -> cla.Array:
         """Return `values` (n, ...) and behind them those of ghosts, in the workspace; `values` if there are none."""
-        if self.part is None:
-            return values
-        extended = engine.scratch((self.rows, *values.shape[1:]), values.dtype)
-        cl.enqueue_copy(engine.queue, buffer_of(extended), buffer_of(values), byte_count=values.nbytes)
-        self.forward(engine, extended)
-        return extended
+        return values if self.part is None else self.part.with_ghosts(engine, values)
 
     @property
     def name_args(self) -> tuple[object, ...]:

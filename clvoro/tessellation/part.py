@@ -173,6 +173,13 @@ class Part:
         if self.ghosts is not None:
             self.ghosts.fill(engine, self.n_own, values)
 
+    def with_ghosts(self, engine: Engine, values: cla.Array) -> cla.Array:
+        """Return `values` (n_own, ...) and behind them those of ghosts, in the workspace."""
+        extended = engine.scratch((self.count, *values.shape[1:]), values.dtype)
+        cl.enqueue_copy(engine.queue, buffer_of(extended), buffer_of(values), byte_count=values.nbytes)
+        self.forward(engine, extended)
+        return extended
+
     def total(self, values: np.ndarray) -> np.ndarray:
         """Return the sum of `values` over all parts, in the order of parts."""
         return values if self.peers is None else np.sum(self.peers.gather(values), axis=0)
