@@ -34,8 +34,10 @@ _SLOPE = 0.6
 """Largest change of the thickness along a wall."""
 _DEPTH, _DEEPER = 2.0, 8.0
 """How far from walls vertices follow: over h, and over the way of the wall."""
-_SWEEPS = 30
-"""Steps that make the way of inner vertices smooth."""
+_SWEEPS = 100
+"""Steps that make the ways of vertices along walls smooth."""
+_RESIDUAL, _MOST = 1e-3, 60
+"""Relative residual and most iterations of the smooth ways of inner vertices."""
 _STIFFER = 20
 """Steps that make the ways of the vertices of a cell linear."""
 _ROUNDS, _THINNER, _LAST_ROUNDS = 7, 0.6, 8
@@ -87,7 +89,7 @@ def add_layers(diagram: Diagram, layers: Sequence[Layers]) -> tuple[Diagram, str
             best = bad, made, share
         if not bad.count:
             break
-        share = walls.thinner(share, bad.vertices, _THINNER if k < _ROUNDS else 0.0)
+        share = walls.thinner(share, bad.vertices, k)
     assert best is not None
     _, made, share = best
     faces, n = made.faces, len(diagram)
@@ -149,6 +151,7 @@ class _LayeredWalls:
         self.vertices, place = np.unique(corners, return_inverse=True)
         self.corners = place.reshape(-1)
         self.stiff = np.zeros(f.n_cells, bool)
+        self._last: np.ndarray | None = None
         self._read(layers)
         self._meet()
 
@@ -240,16 +243,29 @@ class _LayeredWalls:
         count = np.bincount(self.corners, minlength=len(self.vertices))
         return np.bincount(self.corners, h, len(self.vertices)) / count
 
-    def first_shares(self) -> np.ndarray:
-        """Return the shares (u,) of the full way that vertices move: less in gaps, and near places without layers."""
+    @property
+    def _reach(self) -> np.ndarray:
+        """How far from each vertex that moves others follow it, (u,)."""
+        return _DEPTH * self.sizes + _DEEPER * np.linalg.norm(self.way, axis=1)
+
+    @cached_property
+    def _room(self) -> np.ndarray:
+        """How far the wall is that faces each vertex on its way, (u,); inf if that is far, or it does not move."""
         length = np.linalg.norm(self.way, axis=1)
-        share, rows = (length > 0).astype(float), np.flatnonzero(length)
+        room, rows = np.full(len(length), np.inf), np.flatnonzero(length)
         x = self.faces.points[self.vertices[rows]]
         order = np.argsort(~(self.count[self.pair_patch] > 0), kind="stable")  # those with layers first
         patch = np.zeros(len(self.vertices), np.int64)
         patch[self.pair_vertex[order[::-1]]] = self.pair_patch[order[::-1]]
-        room = self.solid.clearance(x, self.way[rows] / length[rows, None], length[rows] / _OF_GAP, patch[rows])
-        share[rows] = np.minimum(1, _OF_GAP * room / length[rows])
+        far = 2 * self._reach[rows]
+        room[rows] = self.solid.clearance(x, self.way[rows] / length[rows, None], far, patch[rows])
+        return room
+
+    def first_shares(self) -> np.ndarray:
+        """Return the shares (u,) of the full way that vertices move: less in gaps, and near places without layers."""
+        length = np.linalg.norm(self.way, axis=1)
+        share, rows = (length > 0).astype(float), np.flatnonzero(length)
+        share[rows] = np.minimum(1, _OF_GAP * self._room[rows] / length[rows])
         return self.smooth(share)
 
     def smooth(self, share: np.ndarray) -> np.ndarray:
@@ -274,13 +290,18 @@ class _LayeredWalls:
                 return np.minimum(share, lower)
             share = np.minimum(share, lower)
 
-    def thinner(self, share: np.ndarray, bad: np.ndarray, factor: float) -> np.ndarray:
-        """Return smaller shares (u,) at the vertices `bad`; around those that have no layers any more, too."""
-        gone = np.zeros(len(share), bool)
-        gone[bad[share[bad] == 0]] = True
-        bad = distinct(np.concatenate([bad, self.end[gone[self.begin]], self.begin[gone[self.end]]]))
+    def thinner(self, share: np.ndarray, bad: np.ndarray, attempt: int) -> np.ndarray:
+        """Return smaller shares (u,) at the vertices `bad`; around those that have no layers any more, too.
+
+        From the attempt `_ROUNDS` on layers end there, each time farther around them.
+        """
+        chosen, gone = np.zeros(len(share), bool), np.zeros(len(share), bool)
+        chosen[bad], gone[bad[share[bad] == 0]] = True, True
+        for _ in range(max(1, attempt - _ROUNDS + 1)):
+            ahead = self.end[gone[self.begin]]
+            gone[ahead] = True
         less = share.copy()
-        less[bad] *= factor
+        less[chosen | gone] *= _THINNER if attempt < _ROUNDS else 0
         return self.smooth(less)
 
     # Vertices that follow.
@@ -297,11 +318,14 @@ class _LayeredWalls:
         taken[self.vertices[self.column]] = True
         creases = moving & (self.n_patches > 1)
         smooth = moving & (self.n_patches < 3)
-        for leaders, free in ((creases, self.vertices[smooth]), (moving, np.flatnonzero(~taken))):
+        # Along a wall up to the middle between two creases.
+        half = np.minimum(self._reach, self._room / 2 / np.sqrt(self.n_patches))
+        slides = (creases, self.vertices[smooth], half)
+        for leaders, free, reach in (slides, (moving, np.flatnonzero(~taken), self._reach)):
             leaders = np.flatnonzero(leaders)
             if not len(leaders):
                 continue
-            reach = _DEPTH * self.sizes[leaders] + _DEEPER * np.linalg.norm(self.way[leaders], axis=1)
+            reach = reach[leaders]
             tree = scipy.spatial.KDTree(x[self.vertices[leaders]])
             away, near = tree.query(x[free], distance_upper_bound=reach.max())
             rows = np.flatnonzero(np.isfinite(away))
@@ -311,6 +335,16 @@ class _LayeredWalls:
         return who, near, weight
 
     @cached_property
+    def _outward(self) -> np.ndarray:
+        """Vertices of creases from which walls turn away, (u,) bool: these move away from their polygons.
+
+        Inner vertices follow them along the wall, and the vertices on the wall above stay.
+        """
+        arm = self.faces.center[self.rows][self.face] - self.faces.points[self.vertices[self.corners]]
+        inward = (arm * self.way[self.corners]).sum(axis=1) * self.layered[self.face]
+        return (np.bincount(self.corners, inward, len(self.vertices)) < 0) & (self.n_patches > 1)
+
+    @cached_property
     def _wall(self) -> np.ndarray:
         """Row in `vertices` of each vertex of the mesh, -1 inside, (v,)."""
         wall = np.full(len(self.faces.points), -1)
@@ -318,8 +352,8 @@ class _LayeredWalls:
         return wall
 
     @cached_property
-    def _means(self) -> scipy.sparse.csr_array:
-        """The mean over the neighbors of each vertex that follows, (b, v). Those of walls are on the same walls."""
+    def _links(self) -> scipy.sparse.csr_array:
+        """Weights of the neighbors of each vertex that follows, (b, v). Those of walls are on the same walls."""
         f, band, wall = self.faces, self._followers[0], self._wall
         place = np.full(len(f.points), -1)
         place[band] = np.arange(len(band))
@@ -339,28 +373,45 @@ class _LayeredWalls:
         begin, end = begin[fits], end[fits]
         row = place[begin]
         weight = 1 / np.maximum(np.linalg.norm(f.points[end] - f.points[begin], axis=1), 1e-300)
-        weight /= np.bincount(row, weight, len(band))[row]
         return scipy.sparse.csr_array((weight, (row, end)), (len(band), len(f.points)))
 
     def moved(self, share: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return where each vertex of the mesh moves, (v, 3), and the points of walls above these, (u, 3)."""
         x = self.faces.points
         way, moved = share[:, None] * self.way, np.zeros_like(x)
-        moved[self.vertices] = way
         band, near, weight = self._followers
         on = np.flatnonzero(self._wall[band] >= 0)
-        rows = self._wall[band[on]]
-        start = weight[:, None] * moved[self.vertices[near]]
+        rows, leaders = self._wall[band[on]], near[on]
+        links, sums = self._links, np.maximum(self._links.sum(axis=1), 1e-300)
+        slides, back = links[on][:, self.vertices], np.where(self._outward, way.T, 0).T
+        whole, above = way.copy(), way.copy()
         for sweep in range(_SWEEPS + 1):
-            moved[band] = self._means @ moved if sweep else start
-            moved[band[on]] = way[rows] + np.einsum("uij,uj->ui", self.along[rows], moved[band[on]])
+            for field, source in ((whole, 0), (above, back)):
+                pull = (
+                    slides @ (field - source) / sums[on, None] if sweep else weight[on, None] * (way - source)[leaders]
+                )
+                field[rows] = way[rows] + np.einsum("uij,uj->ui", self.along[rows], pull)
+        moved[self.vertices] = whole
+        inside = np.flatnonzero(self._wall[band] < 0)
+        moved[band[inside]] = 0
+        pulls, start = links[inside] @ moved, self._last
+        if start is None:
+            start = weight[inside, None] * moved[self.vertices[near[inside]]]
+        matrix = scipy.sparse.diags_array(sums[inside]) - links[inside][:, band[inside]]
+        inverse = scipy.sparse.diags_array(1 / sums[inside])
+        for a in range(3):
+            found, _ = scipy.sparse.linalg.cg(
+                matrix, pulls[:, a], start[:, a], rtol=_RESIDUAL, maxiter=_MOST, M=inverse
+            )
+            moved[band[inside], a] = found
+        self._last = moved[band[inside]]
         self._stiffen(moved)
-        slid = moved[self.vertices] - way
+        slid = above - way
         rows = np.flatnonzero(np.linalg.norm(slid, axis=1) > 1e-9 * self.sizes)
         walls = x[self.vertices]
         walls[rows] = self._onto_patches(rows, walls[rows] + slid[rows])
         moved += x
-        moved[self.vertices] = walls + way
+        moved[self.vertices] = walls + way + (whole - above)
         rows = np.flatnonzero(self.border)
         moved[self.vertices[rows]] = self._onto_patches(rows, moved[self.vertices[rows]], bare=True)
         return moved, walls
