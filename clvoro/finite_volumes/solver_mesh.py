@@ -83,7 +83,7 @@ def _in_polygon(diagram: Diagram, outline: Polygon, parts: np.ndarray, collapse:
         mesh = straight_walls(diagram, outline, parts, kinds)
         if not collapse:
             return mesh.compact()
-        mesh = open_dead_ends(collapse_short_edges(mesh, parts), parts)
+        mesh = open_dead_ends(collapse_short_edges(mesh, parts).compact(), parts)
         mesh = relax_bad_faces(mesh, parts)
         rejected = rejected_polygons(mesh)
         count = int(np.count_nonzero(rejected))

@@ -256,3 +256,4 @@ def test_the_two_sides_of_a_thin_wall_keep_their_cells_apart(ctx):
     square = clvoro.Polygon([(0, 0), (0.995, 0), (1, 1), (1.005, 0), (2, 0), (2, 2), (0, 2)])
     mesh = clvoro.Adapter(ctx).run(square, 0.15, "fast").solver_mesh()
     assert mesh.area_change == 0
+    assert len(np.unique(mesh.corners)) == len(mesh.points)  # OpenFOAM refuses points that no face has
