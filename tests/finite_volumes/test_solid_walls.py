@@ -8,8 +8,10 @@ from scipy.spatial import ConvexHull
 
 import clvoro
 from clvoro.errors import InputError
-from clvoro.finite_volumes.solid_walls.mend import _best_halves, without_cells
-from clvoro.finite_volumes.solid_walls.mesh import diagram_of, off_middle, outer_generators, solid_diagram
+from clvoro.finite_volumes.solid_walls.cures import Cures
+from clvoro.finite_volumes.solid_walls.editing import judge
+from clvoro.finite_volumes.solid_walls.mesh import _Maker, diagram_of, off_middle, outer_generators, solid_diagram
+from clvoro.finite_volumes.solid_walls.near_walls import NearWalls
 from clvoro.finite_volumes.solid_walls.wall_surface import WallSurface
 from clvoro.mesh.connectivity import following
 
@@ -187,7 +189,7 @@ def test_a_plate_thinner_than_a_cell_keeps_its_cells(ctx):
         assert len(d) == len(x)
         assert d.volumes.sum() == pytest.approx(solid.measure, rel=1e-9)
         thin.append(np.count_nonzero(d.faces.measures.determinant < 1e-3))
-    assert thin[0] == len(x)
+    assert thin[0] > 0.25 * len(x)
     assert thin[1] < 0.25 * len(x)
 
 
@@ -198,22 +200,49 @@ def test_a_single_cell_is_refused(ctx):
         solid_diagram(WallSurface(solid), x, h, whole_faces(ctx, solid, x, h))
 
 
-def test_cells_that_are_left_out_become_walls(made):
-    """All other cells stay closed, and lose no face."""
-    _, faces = made
-    cell = int(faces.owner[faces.n_inner])
-    left = without_cells(faces, np.array([cell]))
-    cells, begin, end = sides_of_cells(left)
-    there, back = (np.stack([cells, *ends], axis=1) for ends in ((begin, end), (end, begin)))
-    assert np.array_equal(np.unique(there, axis=0), np.unique(back, axis=0))
-    assert np.allclose(left.volumes, np.delete(faces.volumes, cell), rtol=1e-9)
-    assert left.n_inner == faces.n_inner - (faces.owner[: faces.n_inner] == cell).sum() - (faces.neighbor == cell).sum()
+def l_cell(ctx):
+    """Return the cures of an L whose crease passes through cells without stations, and one of these cells."""
+    solid, x = el(), generators(el())
+    x[np.linalg.norm(x - (1, 1, 0.5), axis=1) < H] += 0.25 * H * np.array([1, -0.6, 0.1])
+    h = np.full(len(x), H)
+    surface = WallSurface(solid)
+    near = NearWalls.of(surface, x, h, whole_faces(ctx, solid, x, h))
+    made = _Maker(surface, near, np.zeros(len(near.sizes), np.int8)).mesh()
+    cures = Cures(surface, made.faces, near.sizes[made.home])
+    return cures, [c for c in range(made.faces.n_cells) if cures._concave_edges(cures.edits, c)]
 
 
-def test_a_bent_wall_polygon_is_split_along_its_bend():
-    bent = np.array([(0, 0, 0), (1, 0, 0), (2, 0, -0.5), (2, 1, -0.5), (1, 1, 0), (0, 1, 0)], float)
-    floor = np.array([(1, 0.5, -2)], float)
-    assert _best_halves(bent, floor, np.array([(0, 0, -1.0)]), np.array([1, 0.5, -1.0])) == (1, 4)
+def test_cures_keep_cells_closed_and_cuts_their_volume(ctx):
+    """Trials of all cures are there; cuts change no volume but by the folds in divided faces."""
+    cures, cells = l_cell(ctx)
+    edits, cell = cures.edits, cells[0]
+    wall_cell = int(edits.mesh.owner[edits.mesh.n_inner])
+    count = {}
+    for name in ("cuts", "transfers", "collapses", "mergers", "halves", "unions", "losses"):
+        for c in (cell, wall_cell):
+            trials = [t for t in getattr(cures, name)(edits, c) if all(t.is_sound(k) for k in t.alive(t.touched))]
+            count[name] = count.get(name, 0) + len(trials)
+        if name in ("cuts", "halves"):
+            for trial in getattr(cures, name)(edits, cell):
+                volume, whole = (sum(cures._volume(e, c) for c in e.alive(trial.touched)) for e in (trial, edits))
+                assert volume == pytest.approx(whole, rel=0.01)
+    assert count["cuts"] > 5
+    assert count["halves"] > 5
+    assert count["unions"] > 0
+
+
+def test_a_cut_makes_two_convex_cells_of_one(ctx):
+    """Its neighbors stay accepted, as divided faces are folded into the cell."""
+    cures, cells = l_cell(ctx)
+    edits, cell = cures.edits, cells[0]
+    assert judge([(edits, [cell])])[0][0][0] > 0
+    found = []
+    for trial in cures.cuts(edits, cell):
+        parts = [cell, edits.next_cell]
+        excess = judge([(trial, parts)])[0][0]
+        found.append(excess.sum())
+        assert len(trial.alive(parts)) == 2
+    assert min(found) == 0
 
 
 @pytest.mark.parametrize("seed", [0, 47, 63, 69, 93])

@@ -73,14 +73,7 @@ def cross_cells(
         edge, low, high, i, j, t, k = (values[~done] for values in (edge, low, high, i, j, t, k))
         edge, low, high = np.concatenate([edge, edge]), np.concatenate([low, t]), np.concatenate([t, high])
         i, j = np.concatenate([i, k]), np.concatenate([k, j])
-    return joined([Crossings(*part) for part in found])
-
-
-def joined(parts: list[Crossings]) -> Crossings:
-    """Return all crossings, sorted."""
-    cells, points, edge = (
-        np.concatenate([getattr(part, name) for part in parts]) for name in ("cells", "points", "edge")
-    )
+    cells, x, edge = (np.concatenate(values) for values in zip(*found, strict=True))
     cells = np.sort(cells, axis=1)
     order = np.lexsort((edge, cells[:, 1], cells[:, 0]))
-    return Crossings(cells[order], points[order], edge[order])
+    return Crossings(cells[order], x[order], edge[order])

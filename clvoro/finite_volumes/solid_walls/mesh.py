@@ -16,9 +16,9 @@ from ...mesh.connectivity import distinct, following, take_ranges, take_rows
 from ...mesh.diagram import Diagram
 from ...mesh.faces import Faces
 from ..collapse import collapse_short
-from .chains import Crossings, cross_cells, joined
-from .cutting import cross_cuts, cut_at_creases
-from .mend import narrow_faces, rejected_at_walls, split_walls, without_cells
+from .chains import Crossings, cross_cells
+from .cures import cured
+from .mend import narrow_faces, rejected_at_walls
 from .near_walls import NearWalls
 from .pierce import IN, WALL, pierce_edges, sides, simplified
 from .polygons import Divider, chain_loops, open_sides
@@ -31,15 +31,14 @@ _CERTAIN = 0.3
 """Vertices are not examined if the depths of their generators show that they are deeper than this share of h."""
 _CLEAR = 1.4
 """Least distance of outer generators from the whole surface, over h: no cell is that wide at a wall."""
-EXACT, CUT, FILLED, ROUNDED = range(4)
-"""How the walls of a cell are made: with all creases; with cuts along concave creases; without concave creases; without
-creases. Each next one makes more cells convex, and leaves out more of the surface."""
+EXACT, FILLED, ROUNDED = range(3)
+"""How the walls of a cell are made: with all creases; without concave creases; without creases.
+
+Each next one makes more cells convex, and leaves out more of the surface."""
 _THIN, _ACROSS = 0.7, 0.35
 """A part of a solid is thin if both walls are nearer to a generator than this share of h; how far generators are spread
 across it, over h."""
 _GOLDEN = (5**0.5 - 1) / 2
-_SLIVER, _TIP = 0.05, 0.4
-"""Rejected cells at walls, and those with neighbors on one side only, with a smaller volume over h^3 are left out."""
 _FEW = 0.03
 """Largest share of generators without a cell; a solid with more of them is refused."""
 _PATIENCE = 3
@@ -166,7 +165,7 @@ def solid_diagram(
     """
     near = NearWalls.of(surface, points, sizes, whole)
     del whole
-    walls = np.full(len(near.sizes), CUT, np.int8)
+    walls = np.full(len(near.sizes), EXACT, np.int8)
     best, kept = None, walls
     since = 0
     for attempt in count(1):
@@ -197,10 +196,7 @@ def solid_diagram(
     lost = np.setdiff1d(np.arange(len(points)), home)
     for rows, text in (
         (points[lost], "generators at {} have no cell: the solid is thinner than a cell, which is left out"),
-        (
-            points[-1 - home[home < 0]],
-            "cells at {} are parts of others, cut where a concave crease passes through them",
-        ),
+        (points[-1 - home[home < 0]], "cells at {} are parts of others, cut where these were concave"),
         (
             near.generators[kept >= FILLED],
             "cells at {} leave out creases or corners, of which several meet within a cell",
@@ -230,19 +226,13 @@ def _made(surface: WallSurface, near: NearWalls, walls: np.ndarray, tell: Callab
     tell("short edges at walls")
     faces = _collapsed(raw.faces, near.sizes[home])
     tell("checks of cells at walls")
-    rejected, tips = rejected_at_walls(faces)
+    rejected = rejected_at_walls(faces)
     if len(rejected):  # where a face has been collapsed, another small one may bulge out
         faces = _collapsed(faces, near.sizes[home])
-        rejected, tips = rejected_at_walls(faces)
+        rejected = rejected_at_walls(faces)
     if len(rejected):
-        share = faces.volumes[rejected] / near.sizes[home[rejected]] ** 3
-        slivers = rejected[share < np.where(tips, _TIP, _SLIVER)]
-        if len(slivers):
-            faces, home, own = without_cells(faces, slivers), np.delete(home, slivers), np.delete(own, slivers)
-            rejected = rejected_at_walls(faces)[0]
-    if len(rejected):
-        faces = split_walls(faces, rejected)
-        rejected = rejected_at_walls(faces)[0]
+        tell("cells that are rejected at walls")
+        faces, home, own, rejected = cured(surface, faces, home, own, near.sizes[home], rejected)
     if not own.all():
         centroids = faces.measures.geometry.centroids
         faces = replace(faces, generators=np.where(own[:, None], faces.generators, centroids))
@@ -267,7 +257,7 @@ def _simplify(walls: np.ndarray, near: NearWalls, rejected: np.ndarray) -> None:
     Parameters
     ----------
     walls : (p + 1,) int8
-        EXACT, CUT, FILLED or ROUNDED.
+        EXACT, FILLED or ROUNDED.
     rejected : (k,) int
     """
     cells, p = near.cells, len(near.rows)
@@ -276,12 +266,7 @@ def _simplify(walls: np.ndarray, near: NearWalls, rejected: np.ndarray) -> None:
     one, other = np.concatenate([one, other]), np.concatenate([other, one])
     mine = np.zeros(p + 1, bool)
     mine[rejected] = True
-    # A cut may spoil a neighbor of the cell.
-    blamed = other[mine[one] & (walls[one] == EXACT) & (walls[other] == CUT)]
-    spared = one[mine[one] & (walls[one] == EXACT) & (walls[other] == CUT)]
-    beside = other[mine[one] & (walls[one] == ROUNDED)]
-    mine[spared] = False
-    mine[blamed] = mine[beside] = True
+    mine[other[mine[one] & (walls[one] == ROUNDED)]] = True
     walls[mine] = np.minimum(walls[mine] + 1, ROUNDED)
 
 
@@ -333,15 +318,12 @@ class _Maker:
 
     def __init__(self, surface: WallSurface, near: NearWalls, walls: np.ndarray) -> None:
         self.surface = surface
-        self.tree, self.h = scipy.spatial.KDTree(near.generators), near.sizes
-        cells = cut_at_creases(self.surface, self.tree, self.h, near.cells, walls == CUT)
-        self.cells = cells.within(len(self.h))
+        self.tree, self.sizes, self.generators = scipy.spatial.KDTree(near.generators), near.sizes, near.generators
+        self.cells = near.cells.within(len(self.sizes))
         self.owner, self.neighbor = self.cells.owner, self.cells.neighbor
         self.starts, self.corners, self.points = self.cells.starts, self.cells.corners, self.cells.points
-        self.n, home = len(self.cells.home), self.cells.home
-        self.at_wall = near.at_wall[home]
-        self.filled, self.rounded = walls[home] >= FILLED, walls[home] == ROUNDED
-        self.generators, self.sizes = near.generators[home], near.sizes[home]
+        self.n, self.at_wall = len(self.sizes), near.at_wall
+        self.filled, self.rounded = walls >= FILLED, walls == ROUNDED
 
     def mesh(self) -> _Made:
         """Return the mesh; no cell is checked."""
@@ -428,7 +410,7 @@ class _Maker:
         apart = self.surface.common(one, other)[0] == 0
         chords, one, other = chords[apart], one[apart], other[apart]
         face = parts.face[np.searchsorted(parts.starts, chords, "right") - 1]
-        crossings = self._crossings()
+        crossings = cross_cells(self.surface, self.generators, self.tree, self.sizes)
         filled = self.filled[crossings.cells].any(axis=1)
         edge = np.minimum(crossings.edge, len(self.surface.ends) - 1)
         crossings = crossings.take(~filled | ~self.surface.solid.creases.concave[edge])
@@ -469,15 +451,6 @@ class _Maker:
             np.insert(parts.chord, rows + 1, True),
         )
         return made.take(np.flatnonzero(counts >= 3))
-
-    def _crossings(self) -> Crossings:
-        """Return where creases cross faces."""
-        found = cross_cells(self.surface, np.asarray(self.tree.data), self.tree, self.h)
-        if not self.cells.cuts:
-            return found
-        chain = self.surface.solid.creases.chain[found.edge]
-        cells = np.stack([self.cells.locate(found.points, column, chain) for column in found.cells.T], axis=1)
-        return joined([replace(found, cells=cells), cross_cuts(self.surface, self.tree, self.h, self.cells)])
 
     def _match(
         self, crossings: Crossings, face: np.ndarray, one: np.ndarray, other: np.ndarray, middle: np.ndarray
@@ -560,13 +533,6 @@ class _Maker:
         after = np.concatenate([parts.items[following(parts.starts)], corners[following(starts)]])
         cell = np.concatenate([self.owner[faces], self.neighbor[faces]])
         begin, end = np.concatenate([here, after]), np.concatenate([after, here])
-        if self.cells.cuts:  # generators lie in one part of a cell only
-            parts_of = np.unique([c for cut in self.cells.cuts for c in (cut.below, cut.above)])
-            rows = np.flatnonzero(np.isin(cell, parts_of))
-            total = np.zeros((self.n, 3))
-            np.add.at(total, cell[rows], self.points[begin[rows]])
-            parts_of = parts_of[total[parts_of].any(axis=1)]
-            self.generators[parts_of] = total[parts_of] / np.bincount(cell[rows], minlength=self.n)[parts_of, None]
         mine = is_open[cell]
         cell, begin, end = open_sides(cell[mine], begin[mine], end[mine])
         label = self._labels(cell, begin, end)
@@ -578,7 +544,7 @@ class _Maker:
         for vertex, c in zip(begin[taken >= 0].tolist(), taken[taken >= 0].tolist(), strict=True):
             corner_vertex[c] = vertex
         corners_of: dict[int, list[int]] = {}
-        cells = self.cells.locate(self.surface.corners, nearest(self.tree, self.surface.corners)[1])
+        cells = nearest(self.tree, self.surface.corners)[1]
         for c, i in enumerate(cells.tolist()):
             if c not in corner_vertex and not self.filled[i]:
                 corners_of.setdefault(i, []).append(c)
@@ -667,11 +633,9 @@ class _Maker:
         seen = np.bincount(owner, minlength=self.n) + np.bincount(neighbor[neighbor >= 0], minlength=self.n) > 0
         number = np.cumsum(seen) - 1
         owner, neighbor = number[owner], np.where(neighbor >= 0, number[np.maximum(neighbor, 0)], neighbor)
-        home, own = self.cells.home[seen], np.flatnonzero(seen) < len(self.h)
-        generators = np.where(own[:, None], np.asarray(self.tree.data)[home], self.generators[seen])
         faces = Faces(
             domain=self.surface.solid,
-            generators=generators,
+            generators=self.generators[seen],
             points=self.points,
             starts=np.concatenate([one[0], one[0][-1] + two[0][1:]]),
             corners=np.concatenate([one[1], two[1]]).astype(np.int32),
@@ -681,4 +645,5 @@ class _Maker:
             shift=np.zeros((f, 3), np.int8),
             half_face=np.concatenate([row[inner], np.full(len(walls), -1)]),
         ).compact()
-        return _Made(faces, home, own, np.zeros(0, np.int64))
+        home = np.flatnonzero(seen)
+        return _Made(faces, home, np.ones(len(home), bool), np.zeros(0, np.int64))

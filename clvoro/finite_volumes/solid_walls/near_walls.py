@@ -5,19 +5,53 @@ All other cells of the solid are one cell meanwhile, the rest. So the work depen
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ...mesh.connectivity import take_rows
 from ...mesh.faces import Faces
-from .cutting import CellFaces
 from .wall_surface import WallSurface
 
 _REACH = 2.5
 """Cells of generators farther from the surface, over h, do not reach it, unless an outer cell is their neighbor."""
 _RINGS = 2
 """Rings of cells around those that reach the surface: one shares vertices that may move, one is their neighbors'."""
+
+
+@dataclass(frozen=True)
+class CellFaces:
+    """Faces of cells that are closed.
+
+    Attributes
+    ----------
+    owner, neighbor : (f,) int
+    starts, corners : (f + 1,), (k,) int
+        Corners, counter-clockwise as seen from the neighbor.
+    points : (v, 3) float
+    row : (f,) int
+        The face of the diagram that each is.
+    """
+
+    owner: np.ndarray
+    neighbor: np.ndarray
+    starts: np.ndarray
+    corners: np.ndarray
+    points: np.ndarray
+    row: np.ndarray
+
+    def within(self, n: int) -> CellFaces:
+        """Return the faces between two of the first `n` cells."""
+        rows = np.flatnonzero((self.owner < n) & (self.neighbor >= 0) & (self.neighbor < n))
+        starts, corners = take_rows(self.starts, self.corners, rows)
+        return replace(
+            self,
+            owner=self.owner[rows],
+            neighbor=self.neighbor[rows],
+            starts=starts,
+            corners=corners,
+            row=self.row[rows],
+        )
 
 
 @dataclass(frozen=True)
@@ -71,15 +105,7 @@ class NearWalls:
         owner[turned], neighbor[turned] = neighbor[turned], p
         starts, corners = take_rows(faces.starts, faces.corners, taken, turned)
         vertices, corners = np.unique(corners, return_inverse=True)
-        cells = CellFaces(
-            owner,
-            neighbor,
-            starts,
-            corners,
-            faces.points[vertices].astype(float),
-            np.arange(p + 1 + faces.n_cells - n),
-            row=taken,
-        )
+        cells = CellFaces(owner, neighbor, starts, corners, faces.points[vertices].astype(float), taken)
         away = np.asarray(surface.solid.upper) + 1e6 * surface.solid.extent
         return cls(
             faces,

@@ -1,0 +1,367 @@
+"""Polyhedra whose faces and vertices are changed one at a time, on trial, and judged as OpenFOAM does."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+
+import numpy as np
+
+from ...mesh.connectivity import take_rows
+from ...mesh.faces import Faces
+from ..defects import concave_pairs
+from ..gate import LEAST_DETERMINANT, LEAST_MEASURE
+from ..measures import PLANAR_COSINE
+
+_MOST_FACES = 200
+"""Cells with more faces stand for many, and are not judged."""
+Face = tuple[int, int, tuple[int, ...]]
+"""Owner, neighbor and corners; see `Faces`."""
+
+
+class Edits:
+    """A mesh in 3D with some faces, cells and points changed.
+
+    Parameters
+    ----------
+    mesh : Faces
+    parent : Edits, optional
+        Changes on top of which these come.
+
+    Attributes
+    ----------
+    touched : set of int
+        Cells whose faces, or whose points, have changed, also those that are gone.
+    """
+
+    def __init__(self, mesh: Faces, parent: Edits | None = None) -> None:
+        self.mesh, self.parent = mesh, parent
+        self._faces: dict[int, Face | None] = {}
+        self._cells: dict[int, frozenset[int]] = {}
+        self._points: dict[int, np.ndarray] = {}
+        self.touched: set[int] = set()
+        if parent is None:
+            self.next_face, self.next_cell, self.next_point = len(mesh), mesh.n_cells, len(mesh.points)
+            starts, places = mesh.cell_faces()
+            self._of_cell, self._face_of = starts, mesh.sides()[1][places]
+            self._known_faces: dict[int, Face] = {}
+            self._known_cells: dict[int, frozenset[int]] = {}
+        else:
+            self._of_cell, self._face_of = parent._of_cell, parent._face_of
+            self._known_faces, self._known_cells = parent._known_faces, parent._known_cells
+            self.next_face, self.next_cell, self.next_point = parent.next_face, parent.next_cell, parent.next_point
+
+    def trial(self) -> Edits:
+        """Return changes on top of these."""
+        return Edits(self.mesh, self)
+
+    def take(self, trial: Edits) -> None:
+        """Make the changes of a trial on top of these, or of a trial on top of such a trial."""
+        if trial.parent is not self:
+            assert trial.parent is not None
+            self.take(trial.parent)
+        self._faces |= trial._faces
+        self._cells |= trial._cells
+        self._points |= trial._points
+        self.touched |= trial.touched
+        self.next_face, self.next_cell, self.next_point = trial.next_face, trial.next_cell, trial.next_point
+
+    # Reading.
+
+    def face(self, k: int) -> Face:
+        """Return a face."""
+        at = self
+        while k not in at._faces:
+            if at.parent is None:
+                if k not in self._known_faces:
+                    m = self.mesh
+                    loop = tuple(m.corners[m.starts[k] : m.starts[k + 1]].tolist())
+                    self._known_faces[k] = int(m.owner[k]), int(m.neighbor[k]), loop
+                return self._known_faces[k]
+            at = at.parent
+        found = at._faces[k]
+        assert found is not None
+        return found
+
+    def faces_of(self, cell: int) -> frozenset[int]:
+        """Return the faces of a cell."""
+        at = self
+        while cell not in at._cells:
+            if at.parent is None:
+                if cell not in self._known_cells:
+                    rows = slice(*self._of_cell[cell : cell + 2]) if cell < self.mesh.n_cells else slice(0)
+                    self._known_cells[cell] = frozenset(self._face_of[rows].tolist())
+                return self._known_cells[cell]
+            at = at.parent
+        return at._cells[cell]
+
+    def is_vast(self, cell: int) -> bool:
+        """Return whether a cell stands for many."""
+        return len(self.faces_of(cell)) > _MOST_FACES
+
+    def point(self, v: int) -> np.ndarray:
+        """Return the position of a vertex."""
+        at: Edits | None = self
+        while at is not None:
+            if v in at._points:
+                return at._points[v]
+            at = at.parent
+        return self.mesh.points[v]
+
+    def positions(self, vertices: Iterable[int]) -> np.ndarray:
+        """Return the positions of vertices, (k, 3)."""
+        return np.array([self.point(v) for v in vertices], float).reshape(-1, 3)
+
+    def across(self, k: int, cell: int) -> int:
+        """Return the cell behind a face of `cell`; negative for walls."""
+        owner, neighbor, _ = self.face(k)
+        return neighbor if owner == cell else owner
+
+    def seen(self, k: int, cell: int) -> tuple[int, ...]:
+        """Return the corners of a face, counter-clockwise as seen from outside of `cell`."""
+        owner, _, loop = self.face(k)
+        return loop if owner == cell else loop[::-1]
+
+    def neighbors(self, cell: int) -> set[int]:
+        """Return the cells behind the faces of a cell."""
+        return {n for k in self.faces_of(cell) if (n := self.across(k, cell)) >= 0}
+
+    def vertices(self, cell: int) -> set[int]:
+        """Return the vertices of a cell."""
+        return {v for k in self.faces_of(cell) for v in self.face(k)[2]}
+
+    def faces_at(self, cell: int, *vertices: int) -> dict[int, set[int]]:
+        """Return the cells that have all of `vertices`, reached from `cell` through such faces, and the faces."""
+        found: dict[int, set[int]] = {}
+        todo = [cell]
+        while todo:
+            c = todo.pop()
+            if c in found:
+                continue
+            found[c] = {k for k in self.faces_of(c) if all(v in self.face(k)[2] for v in vertices)}
+            todo += [n for k in found[c] if (n := self.across(k, c)) >= 0]
+        return found
+
+    def patches_at(self, cell: int, *vertices: int) -> set[int]:
+        """Return the walls (negative numbers) that have all of the vertices."""
+        at = self.faces_at(cell, *vertices)
+        return {n for faces in at.values() for k in faces if (n := self.face(k)[1]) < 0}
+
+    # Changing.
+
+    def drop(self, k: int) -> None:
+        """Remove a face."""
+        for c in self.face(k)[:2]:
+            if c >= 0:
+                self._cells[c] = self.faces_of(c) - {k}
+                self.touched.add(c)
+        self._faces[k] = None
+
+    def put(self, k: int, cell: int, other: int, loop: Iterable[int]) -> None:
+        """Put a face between `cell` and `other`: `loop` is counter-clockwise as seen from outside of `cell`."""
+        loop = tuple(loop)
+        self._faces[k] = (cell, other, loop) if other < 0 or cell < other else (other, cell, loop[::-1])
+        for c in (cell, other):
+            if c >= 0:
+                self._cells[c] = self.faces_of(c) | {k}
+                self.touched.add(c)
+
+    def add(self, cell: int, other: int, loop: Iterable[int]) -> int:
+        """Add a face; see `put`. Return its number."""
+        self.next_face += 1
+        self.put(self.next_face - 1, cell, other, loop)
+        return self.next_face - 1
+
+    def add_cell(self) -> int:
+        """Return the number of a new cell, without faces."""
+        self._cells[self.next_cell] = frozenset()
+        self.touched.add(self.next_cell)
+        self.next_cell += 1
+        return self.next_cell - 1
+
+    def add_point(self, x: np.ndarray) -> int:
+        """Return the number of a new vertex."""
+        self._points[self.next_point] = x
+        self.next_point += 1
+        return self.next_point - 1
+
+    def move(self, cell: int, vertex: int, x: np.ndarray) -> None:
+        """Move a vertex of `cell`."""
+        self._points[vertex] = x
+        self.touched |= self.faces_at(cell, vertex).keys()
+
+    def divide_edge(self, cell: int, a: int, b: int, x: np.ndarray) -> int:
+        """Put a vertex at x on an edge of `cell`, into all faces that have the edge; return its number."""
+        new = self.add_point(x)
+        for k in set().union(*self.faces_at(cell, a, b).values()):
+            owner, neighbor, loop = self.face(k)
+            for place, (p, q) in enumerate(edges_of(loop)):
+                if {p, q} == {a, b}:
+                    self.put(k, owner, neighbor, [*loop[: place + 1], new, *loop[place + 1 :]])
+                    break
+        return new
+
+    def is_sound(self, cell: int) -> bool:
+        """Return whether the faces of a cell close it: each edge belongs to two of them, each corner once to one."""
+        faces = self.faces_of(cell)
+        if not faces:
+            return True
+        seen: set[tuple[int, int]] = set()
+        for k in faces:
+            loop = self.seen(k, cell)
+            if len(loop) < 3 or len(set(loop)) < len(loop) or self.across(k, cell) == cell:
+                return False
+            for edge in edges_of(loop):
+                if edge in seen:
+                    return False
+                seen.add(edge)
+        return len(faces) > 3 and all((b, a) in seen for a, b in seen)
+
+    # Results.
+
+    def alive(self, cells: Iterable[int]) -> list[int]:
+        """Return those of `cells` that have faces, and do not stand for many."""
+        return sorted(c for c in cells if self.faces_of(c) and not self.is_vast(c))
+
+    def result(self) -> tuple[Faces, np.ndarray]:
+        """Return the mesh with all changes, and the number that each of its cells has here."""
+        assert self.parent is None
+        m = self.mesh
+        kept = np.ones(len(m), bool)
+        kept[[k for k in self._faces if k < len(m)]] = False
+        rows = np.flatnonzero(kept)
+        new = [f for f in self._faces.values() if f is not None]
+        owner = np.concatenate([m.owner[rows], [f[0] for f in new]]).astype(np.int64)
+        neighbor = np.concatenate([m.neighbor[rows], [f[1] for f in new]]).astype(np.int64)
+        cells = np.union1d(owner, neighbor[neighbor >= 0])
+        owner, inner = np.searchsorted(cells, owner), neighbor >= 0
+        neighbor = np.where(inner, np.searchsorted(cells, neighbor), neighbor)
+        order = np.lexsort((np.where(inner, neighbor, owner), np.where(inner, owner, -neighbor), ~inner))
+        starts, corners = take_rows(m.starts, m.corners, rows)
+        counts = np.concatenate([np.diff(starts), [len(f[2]) for f in new]]).astype(np.int64)
+        corners = np.concatenate([corners, [v for f in new for v in f[2]]]).astype(np.int32)
+        starts, corners = take_rows(np.concatenate([[0], np.cumsum(counts)]), corners, order)
+        points = np.concatenate([m.points, np.zeros((self.next_point - len(m.points), 3))])
+        for v, x in self._points.items():
+            points[v] = x
+        old = cells < m.n_cells
+        generators = np.zeros((len(cells), 3))
+        generators[old] = m.generators[cells[old]]
+        faces = Faces(
+            domain=m.domain,
+            generators=generators,
+            points=points,
+            starts=starts,
+            corners=corners,
+            owner=owner[order].astype(np.int32),
+            neighbor=neighbor[order].astype(np.int32),
+            twin=np.full(len(order), -1),
+            shift=np.zeros((len(order), 3), np.int8),
+            half_face=np.concatenate([m.half_face[rows], np.full(len(new), -1)])[order],
+        )
+        return faces.compact(), cells
+
+
+def edges_of(loop: tuple[int, ...]) -> Iterator[tuple[int, int]]:
+    """Return each corner of a loop with the next one."""
+    return zip(loop, loop[1:] + loop[:1], strict=True)
+
+
+def judge(trials: list[tuple[Edits, list[int]]]) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Judge some cells of each trial by the criteria of OpenFOAM, all together, as cells of one mesh.
+
+    Returns
+    -------
+    list of (excess, worst)
+        By how much limits are exceeded, over all faces and pairs of faces of each cell, (k,) float, above 0 if OpenFOAM
+        rejects it; and the worst of its measures over the limit, (k,) float.
+    """
+    owner, neighbor, loops, points = [], [], [], []
+    judged: list[int] = []
+    cells = v = 0
+    for edits, chosen in trials:
+        number: dict[int, int] = {}
+        for c in chosen:
+            number.setdefault(c, cells + len(number))
+        judged += [number[c] for c in chosen]
+        for c in chosen:
+            for n in edits.neighbors(c):
+                if edits.is_vast(n):
+                    continue
+                number.setdefault(n, cells + len(number))
+        vertex: dict[int, int] = {}
+        for k in set().union(*(edits.faces_of(c) for c in number)):
+            i, j, loop = edits.face(k)
+            if i not in number:
+                i, j, loop = j, -1, loop[::-1]
+            elif j >= 0 and j not in number:
+                j = -1
+            owner.append(number[i])
+            neighbor.append(number[j] if j >= 0 else -1)
+            loops.append([vertex.setdefault(a, v + len(vertex)) for a in loop])
+        points += [edits.point(a) for a in vertex]
+        cells, v = cells + len(number), v + len(vertex)
+    one, other = np.array(owner), np.array(neighbor)
+    order = np.argsort(other < 0, kind="stable")
+    loops = [loops[k] for k in order.tolist()]
+    one, other = one[order], other[order]
+    turned = (other >= 0) & (other < one)
+    loops = [loop[::-1] if t else loop for loop, t in zip(loops, turned.tolist(), strict=True)]
+    one, other = np.where(turned, other, one), np.where(turned, one, other)
+    f = len(loops)
+    mesh = Faces(
+        domain=trials[0][0].mesh.domain,
+        generators=np.zeros((cells, 3)),
+        points=np.array(points),
+        starts=np.concatenate([[0], np.cumsum([len(loop) for loop in loops])]),
+        corners=np.array([a for loop in loops for a in loop], np.int32),
+        owner=one.astype(np.int32),
+        neighbor=other.astype(np.int32),
+        twin=np.full(f, -1),
+        shift=np.zeros((f, 3), np.int8),
+        half_face=np.full(f, -1),
+    )
+    rows = np.array(judged)
+    mine = np.zeros(cells, bool)
+    mine[rows] = True
+    excess, worst = _measured(mesh, mine)
+    ends = np.cumsum([len(chosen) for _, chosen in trials])[:-1]
+    return list(zip(np.split(np.round(excess[rows], 6), ends), np.split(worst[rows], ends), strict=True))
+
+
+def _measured(mesh: Faces, mine: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return what `judge` does for each cell that is `mine` (n,), (n,) each."""
+    m, g, n = mesh.measures, mesh.measures.geometry, mesh.n_cells
+    c = m.coupled
+    inner = mesh.neighbor >= 0
+    judged = np.flatnonzero(mine[mesh.owner] | (inner & mine[mesh.neighbor]))
+    worst = np.maximum(m.skewness / 4, m.non_orthogonality / 90)
+    worst[c] = np.maximum(worst[c], 0.05 / np.maximum(m.weight[c], 1e-3))
+    worst[c] = np.maximum(worst[c], 0.01 / np.maximum(m.volume_ratio[c], 1e-3))
+    wrong = np.clip(worst - 1, 0, 3)
+    wrong += (worst > 1) | (m.pyramids < -1e-15)
+    wrong += np.linalg.norm(g.areas, axis=1) < LEAST_MEASURE
+    wrong[judged] += m.bad_tetrahedra_of(judged)
+    excess, most = np.zeros(n), np.zeros(n)
+    for cells, rows in ((mesh.owner, slice(None)), (mesh.neighbor[inner], inner)):
+        excess += np.bincount(cells, wrong[rows], n)
+        np.maximum.at(most, cells, worst[rows])
+    cell, angle = find_concave(mesh)
+    excess += np.bincount(cell, 1 + angle, n)
+    flat = LEAST_DETERMINANT / np.maximum(m.determinant, 1e-9)
+    excess += (g.volumes < LEAST_MEASURE) + (flat > 1) + (m.aspect_ratio > 1000)
+    return excess, np.maximum(most, flat)
+
+
+def find_concave(mesh: Faces) -> tuple[np.ndarray, np.ndarray]:
+    """Return for each pair of faces that OpenFOAM takes for concave the cell and the sine of the angle, (p,) each."""
+    cells, face = mesh.sides()
+    starts, places = mesh.cell_faces()
+    face, sign = face[places], np.where(places >= len(mesh), -1.0, 1.0)
+    centers, areas = mesh.measures.geometry.centers[face].T, mesh.measures.geometry.areas[face].T * sign
+    i, j = concave_pairs(
+        np.ascontiguousarray(centers), np.ascontiguousarray(areas), starts, -PLANAR_COSINE, np.ones(len(face), bool)
+    )
+    line = centers[:, j] - centers[:, i]
+    high = (areas[:, i] * line).sum(axis=0)
+    size = np.linalg.norm(areas[:, i], axis=0) * np.linalg.norm(line, axis=0)
+    return cells[places][i], np.maximum(high / np.maximum(size, 1e-300), 0)
