@@ -103,7 +103,7 @@ class Result(Sealed, MeshOutput):
         The options that the method uses, to repeat the run. ``settings["error_target"]`` is the one that the run had,
         given or chosen by the size field, and ``settings["trade"]`` says so in words; ``settings["path"]`` says whether
         the mesh of given points was only corrected, and why; ``settings["widths"]`` says where
-        the default width of layers is below the size field.
+        the default width of layers is below the size field, ``settings["thickness"]`` how thick layers in a solid are.
     origin : (n,) int32 or None
         Index of each generator in the points with which the run began, of a fixed one that of the point whose place it
         has taken; -1 for inserted generators, which come last.
@@ -170,7 +170,7 @@ class Result(Sealed, MeshOutput):
             ``boundary_cells``, ``boundary_mean_error``, ..., and ``inner_cells``, ... for the cells on the boundary and
             the others; and ``corner_cells``, ... for those on the boundary with a corner of more than 30 degrees, where
             the domain limits the quality (None where there is no such cell); and ``left_out_parts`` and
-            ``left_out_area`` of `left_out`.
+            ``left_out_area`` of `left_out`. In a solid with layers ``layer_cells``, and in words their ``thickness``.
 
         Examples
         --------
@@ -253,6 +253,8 @@ def summary(result: Result) -> dict[str, Any]:
     apart = {f"{part}_{name}": value for part, some in parts for name, value in some.items()}
     if result.diagram.domain.outline is not None and not result.diagram.is_power:
         apart |= {"left_out_parts": len(result.left_out), "left_out_area": result.left_out.total}
+    if in_layers := int(np.count_nonzero(result.diagram.layer)):
+        apart |= {"layer_cells": in_layers, "thickness": result.settings.get("thickness")}
     return {
         "cells": len(result.points),
         "steps": int(history["step"][-1]) if len(history) else 0,

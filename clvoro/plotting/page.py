@@ -153,6 +153,8 @@ def _page(
         facts = {**facts, "number of cells": main.scaling}
     if numbers["trade"]:
         facts = {**facts, "sizes and shape": numbers["trade"]}
+    if numbers.get("thickness"):
+        facts = {**facts, "layers": f"{numbers['layer_cells']:,} cells; {numbers['thickness']}"}
     if numbers.get("left_out_parts"):
         facts = {**facts, "mesh for solvers": str(main.left_out)}
     words = "; ".join([f"method {name}", *(f"{k} {v}" for k, v in facts.items())])

@@ -52,7 +52,7 @@ def test_layers_fill_the_cube_with_the_heights_asked_for(cube):
     # One column stands on each wall polygon; all reach the full thickness.
     counts = np.bincount(d.layer, minlength=4)
     assert counts[1] == counts[2] == counts[3] > 30
-    assert "on 100 % of their walls" in cube.settings["thickness"]
+    assert "on 100 % of their walls" in cube.summary()["thickness"]
     # Prisms have their own size, and error 0.
     assert np.abs(cube.size_error[d.layer > 0]).max() < 1e-12
     assert (cube.origin[d.layer > 0] == -1).all()
