@@ -12,6 +12,7 @@ import collections
 import json
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from itertools import pairwise
 from types import SimpleNamespace
 from unittest import mock
@@ -317,6 +318,15 @@ def move_some_far(adapter: clvoro.Adapter) -> None:
     assert abs(t.volumes.get()[:n].sum() - 1) < 1e-4
 
 
+def ordered(adapter: clvoro.Adapter) -> None:
+    """Rows in the order of labels, which only parts have."""
+    for dim in (2, 3):
+        stages, box = stages_of(adapter, dim), clvoro.Box((0,) * dim, (1,) * dim)
+        part = Part.alone(stages.engine.upload(points(30, dim)), box)
+        labels = stages.engine.upload(np.arange(30)[::-1], np.int32)
+        Tessellator(stages, box).tessellate_part(replace(part, labels=labels))
+
+
 def copy(adapter: clvoro.Adapter) -> None:
     """The kernel with which a profile measures the bandwidth, on little memory."""
     source, target = (stages_of(adapter).engine.zeros(256, np.uint8) for _ in range(2))
@@ -473,6 +483,7 @@ WORK: dict[str, Callable[[clvoro.Adapter], None]] = {
     "transfer": transfer,
     "gradation": gradation,
     "copy": copy,
+    "ordered": ordered,
     "polygon": polygon,
     "comb": comb,
     "periodic": periodic,
