@@ -188,10 +188,12 @@ def test_cylinder():
 
 @pytest.mark.slow
 @pytest.mark.skipif(shutil.which("simpleFoam") is None, reason="needs OpenFOAM")
-def test_cavity():
-    """A mesh of blockMesh, in bytes and compressed, is taken over."""
-    followed, uniform = records("cavity.py", "--cells", "800", "--uniform", "800", "--cycles", "2")
-    assert followed["error"] < 0.7 * uniform["error"]
+def test_bodies(tmp_path):
+    options = ("--uniform", "3000", "--graded", "700", "--adapted", "700", "--cycles", "3", "--pictures", str(tmp_path))
+    uniform, graded, adapted = records("bodies.py", *options)
+    assert abs(adapted["error"][0]) < 0.4 * abs(uniform["error"][0])
+    assert abs(graded["error"][0]) < 0.5 * abs(uniform["error"][0])
+    assert (tmp_path / "airfoil.png").read_bytes()[:4] == b"\x89PNG"
 
 
 @pytest.mark.slow
