@@ -887,6 +887,10 @@ ROWS = [
         lambda t: sizing.hessian_size(GRID**4, (0, 0), (1, 1), n_cells=9, growth=1.1),
         lambda t: sizing.Graded(sizing.hessian_size(GRID**4, (0, 0), (1, 1), n_cells=9), 1.1),
     ),
+    (
+        lambda t: sizing.gradient_size(np.ones(30), on=t.mesh, eps=0.1),
+        lambda t: sizing.gradient_size(np.ones(30), on=t.mesh, eps=0.1, h_max=0.3),
+    ),
     # Fields in files.
     (lambda t: clvoro.read_fields(t.fields(POINTS)), lambda t: clvoro.read_fields(t.fields(POINTS), domain=BOX)),
     (

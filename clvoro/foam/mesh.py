@@ -64,8 +64,8 @@ class FoamMesh:
             listed = np.sort(np.concatenate([patch.faces for patch in patches]))
             if not np.array_equal(listed, np.arange(len(neighbor), len(owner))):
                 raise FileError(
-                    f"its patches have {len(listed)} faces, the boundary {len(owner) - len(neighbor)}, expected each of "
-                    "them in one patch"
+                    f"its patches have {len(listed)} faces, the boundary {len(owner) - len(neighbor)}, expected each "
+                    "of them in one patch"
                 )
             names = [patch.name for patch in patches]
             twice = [name for name in names if names.count(name) > 1]

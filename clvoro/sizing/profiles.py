@@ -90,11 +90,13 @@ def best_sizes(
     """Return the sizes that make the L^p norm of the error e = constant * indicator * h^order least.
 
     With l the indicator, h = c l^(-p / (order p + d)), and c^d = (1 / N) integral l^(p d / (order p + d)) for N cells;
-    h is then bounded, its growth limited, and c chosen again.
+    h is then bounded, its growth limited, and c chosen again. An indicator that is 0 everywhere needs `h_max`.
     """
     wanted = check_one_of(what, n_cells, eps)
     top = check_bounds(what, h_min, h_max, places.longest)
     largest = float(indicator.max())
+    if largest == 0 and eps is not None and math.isinf(h_max):
+        raise InputError(f"{what} values have no derivatives other than 0, so eps={eps:g} gives no size; give h_max")
     # l in units that neither overflow nor underflow.
     shape = indicator / largest if largest > 0 else np.zeros(indicator.shape)
     shape[shape < FLAT] = 0

@@ -134,7 +134,8 @@ def test_gradient_size_gives_a_constant_change_per_cell():
 
 def test_constant_solutions_give_h_max():
     flat = np.ones((5, 6))
-    assert sizing.hessian_size(flat, (0, 0), (3, 1), eps=0.1).values == pytest.approx(3)
+    with pytest.raises(InputError, match=r"eps=0.1 gives no size; give h_max"):
+        sizing.hessian_size(flat, (0, 0), (3, 1), eps=0.1)
     assert sizing.gradient_size(flat, (0, 0), (3, 1), eps=0.1, h_max=0.5).values.max() == 0.5
     with pytest.raises(InputError, match=r"other than 0.*use a number"):
         sizing.hessian_size(flat, (0, 0), (3, 1), n_cells=100)
