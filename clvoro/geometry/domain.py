@@ -157,6 +157,9 @@ class Domain(ClipBox):
     curved_walls: bool = False
     """Whether walls may be curved. The faces on them need not be plane, and cells there are not quite Voronoi cells."""
 
+    leaves_out: str = ""
+    """"area" or "volume" where meshes for solvers may leave out parts of the domain; see `Diagram.left_out`."""
+
     extrudes_layers: bool = False
     """Whether layers along walls are prisms, made when the mesh is read, and no rows of fixed generators."""
 
@@ -575,6 +578,28 @@ class Domain(ClipBox):
                 "lon and lat on a sphere"
             )
         return places[:, : self.dim]
+
+    def uncovered(
+        self, walls: Callable[[], tuple[np.ndarray, np.ndarray]], smallest: float
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return what lies between the boundary and the walls of a mesh, if walls may be curved.
+
+        Parameters
+        ----------
+        walls : callable
+            Returns the corners (t, 3, 3) of triangles of the walls, counter-clockwise from outside, and the sizes h of
+            the cells there, (t,). They bound the cells without gaps.
+        smallest : float
+            Volume over h^3 of the smallest parts, but for whole bodies and cavities.
+
+        Returns
+        -------
+        measures : (k,) float
+            Positive for parts of the domain, negative for parts of its outside.
+        places : (k, d) float
+            A point in each.
+        """
+        return np.empty(0), np.empty((0, self.dim))
 
     def narrowest(self, size: Callable[[np.ndarray], np.ndarray]) -> tuple[np.ndarray, float]:
         """Return a place (d,) where the domain is narrowest in units of the sizes `size`, and its width there."""

@@ -205,7 +205,7 @@ class Polygon(Domain):
     def _arrays(self) -> tuple[np.ndarray, ...]:
         return self.vertices, self.ring_starts, self.piece_of_ring
 
-    cuts_cells = True
+    cuts_cells, leaves_out = True, "area"
     projected = False
     """Whether it is known that the coordinates are no degrees, or said that they are."""
 

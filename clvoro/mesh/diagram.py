@@ -420,9 +420,10 @@ class Diagram(MeshOutput):
 
     @property
     def left_out(self) -> LeftOut:
-        """What the mesh for solvers leaves out of a polygon: areas and places of parts, also of land that it covers.
+        """What the mesh for solvers leaves out of a polygon or solid, or adds: measures and places of the parts.
 
-        They are bays, dead ends and islands that cells are too large for. It makes the mesh; see `solver_mesh`.
+        They are bays, dead ends and islands, fins and cavities that cells are too large for. It makes the mesh; see
+        `solver_mesh`. Volumes of parts of solids are counted, to about 0.01 of a cell.
 
         Examples
         --------

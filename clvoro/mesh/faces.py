@@ -241,10 +241,10 @@ class Faces(Sealed):
     @cached_property
     def left_out(self) -> LeftOut:
         """What the cells leave out of the domain, or add to it, where they are too large for its boundary."""
-        from .left_out import LeftOut, left_out_of_polygon
+        from .left_out import left_out_at_walls, left_out_of_polygon
 
         outline = self.domain.outline
-        return LeftOut.nothing(self.dim) if outline is None else left_out_of_polygon(self, outline)
+        return left_out_at_walls(self) if outline is None else left_out_of_polygon(self, outline)
 
     @cached_property
     def images(self) -> np.ndarray:

@@ -10,6 +10,7 @@ import scipy
 import shapely
 
 from ..arguments import format_point
+from .connectivity import following, take_rows
 from .geometry import polygon_areas
 from .read_only import Sealed
 
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
     from .faces import Faces
 
 SMALLEST = 0.25
-"""Smallest area of a part over that of the nearest cell."""
+"""Smallest measure of a part over that of cells there."""
 
 NO_AREA = 1e-14
 """Area of parts that are round-off, over that of the domain."""
@@ -40,11 +41,6 @@ class LeftOut(Sealed):
     measures: np.ndarray
     places: np.ndarray
 
-    @classmethod
-    def nothing(cls, dim: int) -> LeftOut:
-        """Return that of a mesh that fills its domain."""
-        return cls(np.empty(0), np.empty((0, dim)))
-
     @property
     def total(self) -> float:
         """The sum of the absolute measures."""
@@ -63,6 +59,25 @@ class LeftOut(Sealed):
             f"leaves out {parts} of the boundary that cells do not resolve, of the {unit} {self.total:.3g}; the "
             f"largest is at {format_point(self.places[0])}"
         )
+
+
+def left_out_at_walls(mesh: Faces) -> LeftOut:
+    """Return the parts of a solid that the cells of `mesh` do not cover, and the parts of its outside that they cover.
+
+    Parts are left away that are smaller than `SMALLEST` times the cells there. Whole bodies and cavities are found
+    whatever their size is. Of other domains nothing is left out.
+    """
+
+    def triangles() -> tuple[np.ndarray, np.ndarray]:
+        walls = np.arange(mesh.n_inner, mesh.n_outer)
+        starts, corners = take_rows(mesh.starts, mesh.corners, walls)
+        face, after = np.repeat(np.arange(len(walls)), np.diff(starts)), following(starts)
+        ends = mesh.points[corners], mesh.points[corners[after]], mesh.center[walls][face]
+        return np.stack(ends, axis=1), np.cbrt(mesh.volumes[mesh.owner[walls]])[face]
+
+    measures, places = mesh.domain.uncovered(triangles, SMALLEST)
+    order = np.argsort(-np.abs(measures), kind="stable")
+    return LeftOut(measures[order], places[order])
 
 
 def left_out_of_polygon(mesh: Faces, domain: Polygon) -> LeftOut:

@@ -170,7 +170,8 @@ class Result(Sealed, MeshOutput):
             ``boundary_cells``, ``boundary_mean_error``, ..., and ``inner_cells``, ... for the cells on the boundary and
             the others; and ``corner_cells``, ... for those on the boundary with a corner of more than 30 degrees, where
             the domain limits the quality (None where there is no such cell); and ``left_out_parts`` and
-            ``left_out_area`` of `left_out`. In a solid with layers ``layer_cells``, and in words their ``thickness``.
+            ``left_out_area`` of `left_out`. In a solid ``left_out_parts`` and ``left_out_volume``; with layers also
+            ``layer_cells``, and in words their ``thickness``.
 
         Examples
         --------
@@ -251,8 +252,10 @@ def summary(result: Result) -> dict[str, Any]:
     history = result.history
     parts = beside_boundary(result).items()
     apart = {f"{part}_{name}": value for part, some in parts for name, value in some.items()}
-    if result.diagram.domain.outline is not None and not result.diagram.is_power:
-        apart |= {"left_out_parts": len(result.left_out), "left_out_area": result.left_out.total}
+    what = result.diagram.domain.leaves_out
+    if what and not result.diagram.is_power:
+        left = result.diagram.left_out
+        apart |= {"left_out_parts": len(left), f"left_out_{what}": left.total}
     if in_layers := int(np.count_nonzero(result.diagram.layer)):
         apart |= {"layer_cells": in_layers, "thickness": result.settings.get("thickness")}
     return {

@@ -185,6 +185,7 @@ class Solid(Domain):
     """
 
     curved_walls = extrudes_layers = True
+    leaves_out = "volume"
 
     def __init__(
         self,
@@ -518,6 +519,14 @@ class Solid(Domain):
         """
         del free, fixed
         return place_stations(self, size)
+
+    def uncovered(
+        self, walls: Callable[[], tuple[np.ndarray, np.ndarray]], smallest: float
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return the parts that a mesh does not cover, and those of the outside that it covers."""
+        from .uncovered import uncovered
+
+        return uncovered(self, *walls(), smallest)
 
     def narrowest(self, size: Callable[[np.ndarray], np.ndarray]) -> tuple[np.ndarray, float]:
         """Return a place (3,) where the solid is narrowest in units of the sizes `size`, and its width there.

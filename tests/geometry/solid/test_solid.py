@@ -169,3 +169,21 @@ def test_thin_parts_and_gaps_are_found():
 def test_wrong_sizes_of_shapes_are_named(made, said):
     with pytest.raises(InputError, match=said):
         made()
+
+
+def test_parts_without_cells():
+    """A mesh has the walls of a cube: what a solid has besides is left out, and what it lacks is covered."""
+    cube, h = Solid.box((0, 0, 0), (1, 1, 1)), 0.2
+    fin, dent = Solid.box((0.4, 0.4, 0.9), (0.6, 0.6, 1.3)), Solid.box((0.3, 0.3, 0.7), (0.7, 0.7, 1.2))
+    cavity, other = Solid.ball((0.5, 0.5, 0.5), 0.05, edge=0.02), Solid.ball((3, 0, 0), 0.3, edge=0.1)
+    for solid, volume, places, share in (
+        (cube, [], [], 0),
+        (cube + fin, [0.012], [(0.5, 0.5, 1.2)], 0.05),
+        (cube - dent, [-0.048], [(0.5, 0.5, 0.85)], 0.15),  # near its edges the walls are not far
+        (cube - cavity, [-cavity.measure], [(0.5, 0.5, 0.5)], 1e-9),
+        (cube + other, [other.measure], [(3, 0, 0)], 1e-9),
+    ):
+        measures, found = solid.uncovered(lambda: (cube.surface.corners, np.full(12, h)), 0.25)
+        assert measures == pytest.approx(volume, rel=share)
+        assert np.abs(found - np.array(places).reshape(-1, 3)).max(initial=0) < 0.35
+        assert (solid.covers(found) == (measures > 0)).all()
