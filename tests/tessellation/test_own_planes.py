@@ -7,9 +7,10 @@ import pytest
 
 import clvoro
 from clvoro.geometry.solid.solid import Solid
+from clvoro.geometry.triangles import packed_rows, packed_weights
 from clvoro.opencl.engine import Engine
 from clvoro.tessellation.device_diagram import read_report
-from clvoro.tessellation.own_planes import SolidBox
+from clvoro.tessellation.own_planes import SolidBox, SurfaceSearch
 from clvoro.tessellation.stages import TessellationStages
 from clvoro.tessellation.tessellator import Tessellator
 from tests.reference.own_planes import own_planes
@@ -112,6 +113,24 @@ def test_planes_are_those_of_the_reference(ctx, name, real):
     assert (-1 - labels[found] == expected.patch).all()
     assert np.abs(planes[found, :3] - expected.normal).max() < 1e3 * np.finfo(real).eps
     assert np.abs(planes[found, 3] * scale - expected.depth).max() < 1e2 * np.finfo(real).eps
+
+
+@pytest.mark.parametrize("real", REALS, ids=str)
+@pytest.mark.parametrize("name", ["L", "ball"])
+def test_nearest_triangles_are_those_of_all(ctx, name, real):
+    solid, reach = SOLIDS[name](), 0.1
+    adapter = clvoro.Adapter(ctx)
+    engine = Engine(adapter.ctx, adapter.queue, 3, real, solid.traits(real))
+    search = SurfaceSearch(engine, solid, solid.wall_triangles)
+    x = np.random.default_rng(3).uniform(solid.lower, solid.upper, (200, 3))
+    corners = solid.surface.corners
+    each = np.stack([np.sqrt(packed_weights(x, packed_rows(np.repeat(t[None], len(x), 0)))[2]) for t in corners])
+    best, noise = each.min(axis=0), float(1e2 * np.finfo(real).eps)
+    found = search.nearest(x, np.inf)
+    assert each[found, np.arange(len(x))] == pytest.approx(best, abs=noise)
+    near = search.nearest(x, reach)
+    assert ((near >= 0) == (best <= reach)).all()
+    assert (near[near >= 0] == found[near >= 0]).all()
 
 
 @pytest.mark.parametrize("real", REALS, ids=str)
