@@ -42,7 +42,7 @@ _REACH = 0.3
 """Distance over h of a crease or corner to which a vertex may be moved."""
 _SLIVER, _TIP, _FEW = 0.05, 0.4, 4
 """Cells with a smaller volume over h^3 may be left out; those with fewer neighbors than this may be larger."""
-_BUDGET, _MOST = 12, 1000
+_BUDGET, _MOST = 12, 400
 """Most changes of one rejected cell at a time, and most searches for cures of a mesh."""
 
 _AHEAD = 1
@@ -448,7 +448,16 @@ class Cures:
                     yield trial
 
     def losses(self, edits: Edits, cell: int) -> Iterator[Edits]:
-        """Leave out a small cell at a wall: its faces to others become walls in its place."""
+        """Leave out a small cell at a wall: its faces to others become walls in its place. Or a few without others."""
+        part, beside = {cell}, edits.neighbors(cell)
+        while not beside <= part and len(part) < _FEW:
+            part |= beside
+            beside = set().union(*(edits.neighbors(c) for c in part))
+        if beside <= part and len(part) <= _FEW:
+            trial = edits.trial()
+            for k in set().union(*(edits.faces_of(c) for c in part)):
+                trial.drop(k)
+            yield trial
         walls = [k for k in edits.faces_of(cell) if edits.across(k, cell) < 0]
         inner = sorted(set(edits.faces_of(cell)) - set(walls))
         if walls and self._volume(edits, cell) < (_TIP if len(inner) < _FEW else _SLIVER) * self.h(cell) ** 3:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache
-from itertools import count
 
 import numpy as np
 import scipy
@@ -41,8 +40,8 @@ across it, over h."""
 _GOLDEN = (5**0.5 - 1) / 2
 _FEW = 0.03
 """Largest share of generators without a cell; a solid with more of them is refused."""
-_PATIENCE = 3
-"""How often a mesh is made again without fewer rejected cells than before."""
+_PATIENCE, _ATTEMPTS = 3, 8
+"""How often a mesh is made again without fewer rejected cells than before, and at all."""
 _MISSED = 0.1
 """A crossing of a crease becomes a vertex of a chord on its face that is farther from it than this share of h."""
 
@@ -168,7 +167,7 @@ def solid_diagram(
     walls = np.full(len(near.sizes), EXACT, np.int8)
     best, kept = None, walls
     since = 0
-    for attempt in count(1):
+    for attempt in range(1, _ATTEMPTS + 1):
         if since == _PATIENCE:
             break
         number = "" if attempt == 1 else f", attempt {attempt}"
