@@ -42,6 +42,8 @@ _REACH = 0.3
 """Distance over h of a crease or corner to which a vertex may be moved."""
 _SLIVER, _TIP, _FEW = 0.05, 0.4, 4
 """Cells with a smaller volume over h^3 may be left out; those with fewer neighbors than this may be larger."""
+_TOO_MANY = 0.2
+"""Where more than this share of the cells are rejected, the solid is as thin as a cell, and no cure is tried."""
 _BUDGET, _MOST = 12, 400
 """Most changes of one rejected cell at a time, and most searches for cures of a mesh."""
 
@@ -589,6 +591,8 @@ def cured(
     surface: WallSurface, faces: Faces, home: np.ndarray, own: np.ndarray, sizes: np.ndarray, rejected: np.ndarray
 ) -> tuple[Faces, np.ndarray, np.ndarray, np.ndarray]:
     """Return the mesh with its `rejected` cells (k,) cured where that works, and `home`, `own` and what is rejected."""
+    if len(rejected) > _TOO_MANY * faces.n_cells:
+        return faces, home, own, rejected
     cures = Cures(surface, faces, sizes)
     todo, changed = rejected.tolist(), True
     while changed:
