@@ -590,7 +590,10 @@ def _components(loops: list[tuple[int, ...]], border: set[tuple[int, int]]) -> l
 def cured(
     surface: WallSurface, faces: Faces, home: np.ndarray, own: np.ndarray, sizes: np.ndarray, rejected: np.ndarray
 ) -> tuple[Faces, np.ndarray, np.ndarray, np.ndarray]:
-    """Return the mesh with its `rejected` cells (k,) cured where that works, and `home`, `own` and what is rejected."""
+    """Return the mesh with its `rejected` cells (k,) cured where that works, and `home`, `own` and what is rejected.
+
+    Trials judge the cells that they touch. A mesh with more rejected cells in all than before is not taken.
+    """
     if len(rejected) > _TOO_MANY * faces.n_cells:
         return faces, home, own, rejected
     cures = Cures(surface, faces, sizes)
@@ -603,7 +606,10 @@ def cured(
                     break
                 changed = True
         todo = cures.edits.alive({*rejected.tolist(), *cures.edits.touched})
-    faces, cells = cures.edits.result()
+    made, cells = cures.edits.result()
+    left = rejected_at_walls(made)
+    if len(left) > len(rejected):
+        return faces, home, own, rejected
     origin = np.array([cures.home.get(c, c) for c in cells.tolist()])
-    home, own = home[origin], (cells < len(own)) & np.append(own, np.zeros(cures.edits.next_cell, bool))[cells]
-    return faces, home, own, rejected_at_walls(faces)
+    is_own = (cells < len(own)) & np.append(own, np.zeros(cures.edits.next_cell, bool))[cells]
+    return made, home[origin], is_own, left
