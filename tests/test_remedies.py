@@ -1005,6 +1005,7 @@ ROWS = [
 
 TESTED_IN = {
     "this process was forked": "robustness/test_unattended.py::test_forked_processes_are_told_that_they_cannot_work",
+    "as much, since its values": "foam/test_foam_cases.py::test_bad_input_changes_nothing",
     "cells meet at a vertex": "tessellation/test_vertices.py::test_walks_around_a_vertex_end",
 }
 """Parts of texts of errors without a row, and the tests that raise them."""
@@ -1013,7 +1014,7 @@ TESTED_IN = {
 LIBRARIES = {
     "cannot be read as STEP": "gmsh",
     "holds no solid": "gmsh",
-    "is it damaged? Else": "netCDF4",
+    "is it damaged? Else": "xarray",
     "borders on its own periodic image": "fipy",
 }
 """Parts of texts of errors, and the library that their rows need."""

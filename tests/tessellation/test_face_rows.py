@@ -92,7 +92,7 @@ def test_incremental_update_has_room_for_long_rows(engine, monkeypatch):
     assert repaired is not None
     repaired = patch.fetch(repaired)
     n = len(points)
-    anew = patch.fetch(Cells(engine).tessellate(BOX, moved, n, Bins(engine).build(BOX, moved, n)))
+    anew = patch.fetch(Cells(engine).tessellate(Part.alone(moved, BOX), Bins(engine).build(BOX, moved, n)))
     assert np.array_equal(np.diff(repaired.starts)[:4], [SPOKES] * 4)
     assert np.array_equal(repaired.starts, anew.starts)
     assert np.array_equal(repaired.neighbors, anew.neighbors)

@@ -6,6 +6,7 @@ from scipy.spatial import ConvexHull
 
 from clvoro.tessellation.bins import MAX_LEVELS, Bins
 from clvoro.tessellation.cells import EIGHTS, FIRST_REACH, LANES, Cells
+from clvoro.tessellation.part import Part
 from tests.reference import patch
 
 BOX = patch.BOX
@@ -110,7 +111,7 @@ def test_rows_are_those_of_clipping(engine, name):
         cells.take_rows = lambda n, taken=taken, take=take, **options: taken.append(take(n, **options)) or taken[-1]
         if not wrap:
             cells._hulls = None
-        t = patch.fetch(cells.tessellate(BOX, x, n, binned, exact=False))
+        t = patch.fetch(cells.tessellate(Part.alone(x, BOX), binned, exact=False))
         found.append((t, taken[-1].counts.get()[:n], binned.reach.get()[:n]))
     (a, counts_a, reach_a), (b, counts_b, reach_b) = found
     assert np.array_equal(counts_a, counts_b), "other faces, or other doubts"
@@ -139,7 +140,7 @@ def test_measures_in_lanes_are_those_of_single_cells(engine, name):
 
         cells._build = build_so
         cells._build(cells.cell_capacity, cells.row_capacity)
-        found.append(patch.fetch(cells.tessellate(BOX, x, n, binned, exact=False)))
+        found.append(patch.fetch(cells.tessellate(Part.alone(x, BOX), binned, exact=False)))
     a, b = found
     for field in ("starts", "neighbors", "face_measures", "face_centroids", "volumes", "offsets", "covariances"):
         assert np.array_equal(getattr(a, field), getattr(b, field)), field
@@ -202,7 +203,7 @@ def test_cells_that_span_many_bins(engine):
     nearest = np.argsort(np.hypot(*(points - [0.4, 0.3]).T))[:40]
     cells, x = Cells(engine), engine.upload(points)
     cells._hulls = None
-    t = patch.fetch(cells.tessellate(BOX, x, len(points), Bins(engine).build(BOX, x, len(points))))
+    t = patch.fetch(cells.tessellate(Part.alone(x, BOX), Bins(engine).build(BOX, x, len(points))))
     for i in nearest:
         d = np.delete(points, i, axis=0) - points[i]
         hull = ConvexHull(d / (d**2).sum(axis=1)[:, None]).vertices

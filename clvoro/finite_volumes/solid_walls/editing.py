@@ -109,7 +109,19 @@ class Edits:
 
     def positions(self, vertices: Iterable[int]) -> np.ndarray:
         """Return the positions of vertices, (k, 3)."""
-        return np.array([self.point(v) for v in vertices], float).reshape(-1, 3)
+        numbers = list(vertices)
+        x = self.mesh.points[np.minimum(np.array(numbers, np.int64), len(self.mesh.points) - 1)]
+        changed: dict[int, np.ndarray] = {}
+        wanted = set(numbers)
+        at: Edits | None = self
+        while at is not None:
+            changed = {v: at._points[v] for v in wanted & at._points.keys()} | changed
+            at = at.parent
+        if changed:
+            for k, v in enumerate(numbers):
+                if v in changed:
+                    x[k] = changed[v]
+        return x
 
     def across(self, k: int, cell: int) -> int:
         """Return the cell behind a face of `cell`; negative for walls."""
@@ -298,7 +310,7 @@ def judge(trials: list[tuple[Edits, list[int]]]) -> list[tuple[np.ndarray, np.nd
             owner.append(number[i])
             neighbor.append(number[j] if j >= 0 else -1)
             loops.append([vertex.setdefault(a, v + len(vertex)) for a in loop])
-        points += [edits.point(a) for a in vertex]
+        points.append(edits.positions(vertex))
         cells, v = cells + len(number), v + len(vertex)
     one, other = np.array(owner), np.array(neighbor)
     order = np.argsort(other < 0, kind="stable")
@@ -311,7 +323,7 @@ def judge(trials: list[tuple[Edits, list[int]]]) -> list[tuple[np.ndarray, np.nd
     mesh = Faces(
         domain=trials[0][0].mesh.domain,
         generators=np.zeros((cells, 3)),
-        points=np.array(points),
+        points=np.concatenate(points),
         starts=np.concatenate([[0], np.cumsum([len(loop) for loop in loops])]),
         corners=np.array([a for loop in loops for a in loop], np.int32),
         owner=one.astype(np.int32),
