@@ -205,9 +205,7 @@ def test_names_of_arrays(adapter, result):
     with pytest.raises(AttributeError, match="a Diagram has no 'areas'; it has points, volumes, "):
         _ = result.diagram.areas
     solid = adapter.diagram(clvoro.Box((0, 0, 0), (1, 1, 1)), [(0.5, 0.5, 0.5)])
-    with pytest.raises(
-        AttributeError, match=r"in 3D has no cell_vertices; it has .*face_vertices, weights, layer$"
-    ):
+    with pytest.raises(AttributeError, match=r"in 3D has no cell_vertices; it has .*face_vertices, weights, layer$"):
         _ = solid.cell_vertices
     assert not hasattr(copy.copy(result.diagram), "_cells")
 
