@@ -402,7 +402,8 @@ class Adapter:
 
         A run of some thousand cells needs at most a quarter more, and no less than three quarters of it. Where sizes
         change several-fold from one cell to the next it may need half of it. The estimate includes reading all arrays
-        of the diagram afterwards: in 3D that needs more than the run.
+        of the diagram afterwards: in 3D that needs more than the run. Prisms in layers of solids are made on the
+        host, and do not count; where they need more than this process may use, the run is refused, too.
 
         Parameters
         ----------

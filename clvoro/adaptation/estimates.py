@@ -12,6 +12,7 @@ from ..errors import MemoryLimitError
 from ..geometry.domain import Domain
 from ..opencl import memory_limits
 from ..opencl.engine import Engine
+from ..opencl.host_memory import host_memory
 from ..opencl.memory_limits import available_memory, in_bytes
 from ..opencl.workspace import KEPT
 from ..tessellation.cut_cells import clipping_space
@@ -34,6 +35,8 @@ CELLS_PER_BOUNDARY_CELL, CELLS_PER_EDGE = 1.5, 0.3
 CELLS_PER_WALL_CELL = 1.0
 """As many cells take as much as a cell at the surface of a solid takes in addition: above all the generator outside of
 it when the mesh is read."""
+BYTES_PER_PRISM = 4000
+"""Memory of the host for each prism in layers of a solid, at the peak of making the mesh."""
 LARGEST = 0.2
 """Share of the largest array."""
 FIXED = 2**16 + KEPT
@@ -160,6 +163,21 @@ def check_memory(
             f"at most {in_bytes(most)} for one array. {remedy}"
         )
     return needed
+
+
+def check_prisms(count: float) -> None:
+    """Check that the host has memory for `count` prisms in layers of a solid; the device has none of them.
+
+    Raises
+    ------
+    MemoryLimitError
+    """
+    needed, available = BYTES_PER_PRISM * count, host_memory()
+    if needed > available:
+        raise MemoryLimitError(
+            f"layers have about {count:.3g} prisms, which need {in_bytes(needed)}; this process has "
+            f"{in_bytes(available)}. Use fewer layers, on fewer patches, or larger sizes at these walls"
+        )
 
 
 # What follows from the size field.

@@ -15,6 +15,7 @@ from ..geometry.boundary_layers import (
     beyond_layers,
     check_extruded,
     check_gaps,
+    count_prisms,
     count_rows,
     free_domain,
     place_layers,
@@ -27,7 +28,7 @@ from ..sizing import Sizing, as_field
 from ..sizing.distance import limit_beside_layers, limit_beside_lines
 from ..sizing.field import Field, on_domain
 from .diagnostics import check_precision, warn_of_mismatches, warn_of_narrow_parts
-from .estimates import SAMPLE, Extras, check_memory, expected_images, expected_surplus
+from .estimates import SAMPLE, Extras, check_memory, check_prisms, expected_images, expected_surplus
 from .fixed_points import check_room, place_beside_lines, place_in_corners
 from .methods import MOVING, Relaxation, make_method
 from .moving.lattice import lattice_points
@@ -155,6 +156,8 @@ def prepare(
     if options.levels == "auto" and max_levels is not None:
         levels = min(levels, max_levels)
     most = max(target, 0 if points is None else len(points))
+    if domain.extrudes_layers:
+        check_prisms(count_prisms(domain, options.layers, lambda x: factor * sizing(x)))
     memory = _estimate_memory(setup, options, tree, required, most, levels)
     return Prepared(options, setup, points, rows, tree, required, target, lattice, levels, memory)
 

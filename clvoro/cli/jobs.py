@@ -27,7 +27,7 @@ from ..finite_volumes.solver_mesh import WallShape
 from ..io import save, write, write_history
 from ..io.check_mesh import run_check_mesh
 from ..io.foam import PatchType, patch_types
-from ..mesh.results import Result, boundary_line, summary
+from ..mesh.results import Result, boundary_line, summary, thickness_in_words
 from ..opencl.memory_limits import available_memory, in_bytes
 from ..opencl.profile import Profile
 from ..opencl.program import build_seconds
@@ -434,7 +434,8 @@ class Job:
         if build_seconds() > 2:
             print(f"building kernels took {build_seconds():.1f} s; the driver keeps them for later runs")
         for name, result in results.items():
-            for said in (result.scaling, result.settings.get("widths")):
+            thickness = thickness_in_words(result.settings.get("thickness", ()))
+            for said in (result.scaling, result.settings.get("widths"), *thickness):
                 if said:
                     print(f"{name}: {said}")
             if "trade" in result.settings:

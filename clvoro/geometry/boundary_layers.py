@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, cast
 
@@ -28,6 +28,8 @@ _NO_ROOM = "layers leave no room for other cells; make them thinner, or choose f
 _TIGHT = 0.25  # share of the columns in gaps without room for them, above which layers are refused
 _FILLED = 0.8  # share of a gap that layers may fill
 _FACING = -0.5  # cosine between the normals of two walls that face each other
+_MOST = 32767  # layers of prisms: their numbers have 16 bits
+_SAMPLE = 1024  # points on walls at which sizes are averaged
 _OWN = 0.9  # of its distance from its wall: a generator that is nearer to another wall than this is dropped
 
 
@@ -77,7 +79,8 @@ class Layers:
     layers meets one without at about a right angle, the sides of the prisms lie on that patch. Layers fill at most 0.15
     of a gap from each side, taper to nothing at other borders and at sharp edges, and are thinner where cells would be
     invalid: a warning says where, and ``settings["thickness"]`` of the result how thick they are. `n_cells` counts the
-    cells without prisms. OpenFOAM's `checkMesh` refuses prisms that are more than 1000 times as wide as high.
+    cells without prisms, and `Adapter.memory_needed`, the memory of the device, does not depend on them. OpenFOAM's
+    `checkMesh` refuses prisms that are more than 1000 times as wide as high.
 
     Examples
     --------
@@ -335,8 +338,8 @@ def check_extruded(domain: Domain, layers: Sequence[Layers]) -> None:
     Raises
     ------
     InputError
-        If a layer has a spacing, a patch has several layers, layers are thicker than the solid, or patches that meet
-        have layers of different count.
+        If layers are too many, a layer has a spacing, a patch has several layers, layers are thicker than the solid, or
+        patches that meet have layers of different count.
     InputTypeError
         If an item is not `Layers`.
     """
@@ -344,6 +347,8 @@ def check_extruded(domain: Domain, layers: Sequence[Layers]) -> None:
     for k, layer in enumerate(layers):
         if not isinstance(layer, Layers):
             raise InputTypeError(f"layers has a {type(layer).__name__}, expected clvoro.Layers")
+        if layer.count > _MOST:
+            raise InputError(f"layers[{k}] has count = {layer.count}, expected at most {_MOST}; use fewer layers")
         if layer.spacing is not None:
             raise InputError(
                 f"layers[{k}] has spacing = {layer.spacing:g}, expected none in a solid, where prisms are as wide as "
@@ -370,6 +375,16 @@ def check_extruded(domain: Domain, layers: Sequence[Layers]) -> None:
             f"layers have count {a} on {one!r} and {b} on {other!r}, which meet at a crease, expected one count; give "
             f"both count={max(a, b)}, with heights of your choice"
         )
+
+
+def count_prisms(domain: Domain, layers: Sequence[Layers], size: Callable[[np.ndarray], np.ndarray]) -> float:
+    """Return about how many prisms `layers` of a solid have, where wall polygons are as wide as `size` at points."""
+    total = 0.0
+    for layer in layers:
+        walls = cast("Surface", domain.boundary(layer.edges))
+        h = np.asarray(size(walls.landmarks(float(domain.extent.min()) / 8, _SAMPLE)), float)
+        total += layer.count * float(walls.areas.sum()) * float((h**-2).mean())
+    return total
 
 
 def beyond_layers(domain: Domain, layers: Sequence[Layers], points: np.ndarray) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, overload
 
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
     from ..finite_volumes.gate import Solver, SolverReport
     from ..finite_volumes.solver_mesh import WallShape
     from .check.findings import Report
+    from .left_out import LeftOut
     from .quality import Measures
 
 HISTORY_DTYPE = np.dtype(
@@ -103,7 +105,9 @@ class Result(Sealed, MeshOutput):
         The options that the method uses, to repeat the run. ``settings["error_target"]`` is the one that the run had,
         given or chosen by the size field, and ``settings["trade"]`` says so in words; ``settings["path"]`` says whether
         the mesh of given points was only corrected, and why; ``settings["widths"]`` says where
-        the default width of layers is below the size field, ``settings["thickness"]`` how thick layers in a solid are.
+        the default width of layers is below the size field. ``settings["thickness"]`` has a dict for each of the layers
+        in a solid, with the thickness ``asked`` for, the ``min``, ``mean`` and ``max`` on polygons of the wall, and
+        ``full_share``, the share of the wall's area where it is at least 0.9 of that.
     origin : (n,) int32 or None
         Index of each generator in the points with which the run began, of a fixed one that of the point whose place it
         has taken; -1 for inserted generators, which come last.
@@ -171,7 +175,7 @@ class Result(Sealed, MeshOutput):
             the others; and ``corner_cells``, ... for those on the boundary with a corner of more than 30 degrees, where
             the domain limits the quality (None where there is no such cell); and ``left_out_parts`` and
             ``left_out_area`` of `left_out`. In a solid ``left_out_parts`` and ``left_out_volume``; with layers also
-            ``layer_cells``, and in words their ``thickness``.
+            ``layer_cells``, and their ``thickness`` as in `settings`.
 
         Examples
         --------
@@ -181,6 +185,11 @@ class Result(Sealed, MeshOutput):
         (True, 'plan completed')
         """
         return summary(self)
+
+    @property
+    def left_out(self) -> LeftOut:
+        """What the mesh for solvers leaves out of a polygon or solid, or adds; see `Diagram.left_out`."""
+        return self.diagram.left_out
 
     @property
     def measures(self) -> Measures:
@@ -297,6 +306,15 @@ def beside_boundary(result: Result) -> dict[str, dict[str, Any]]:
             "min_quality": float(quality.min()) if some else None,
         }
     return found
+
+
+def thickness_in_words(thickness: Sequence[Mapping[str, float]]) -> list[str]:
+    """Return for each of the layers in a solid in words how thick they are; see `Result.settings`."""
+    return [
+        f"layers[{k}] are {t['min']:.3g} to {t['max']:.3g} thick, {t['mean']:.3g} in the mean, and {t['asked']:.3g} on "
+        f"{100 * t['full_share']:.3g} % of their walls"
+        for k, t in enumerate(thickness)
+    ]
 
 
 def boundary_line(result: Result) -> str:

@@ -13,7 +13,7 @@ import numpy as np
 
 from ..errors import MissingLibraryError, MissingPicturesWarning
 from ..io.atomic import atomic_file, writing
-from ..mesh.results import Result, beside_boundary, summary
+from ..mesh.results import Result, beside_boundary, summary, thickness_in_words
 from .pictures import draw, pictures_of, render
 
 _STYLE = """
@@ -154,7 +154,8 @@ def _page(
     if numbers["trade"]:
         facts = {**facts, "sizes and shape": numbers["trade"]}
     if numbers.get("thickness"):
-        facts = {**facts, "layers": f"{numbers['layer_cells']:,} cells; {numbers['thickness']}"}
+        words = [f"{numbers['layer_cells']:,} cells", *thickness_in_words(numbers["thickness"])]
+        facts = {**facts, "layers": "; ".join(words)}
     if numbers.get("left_out_parts"):
         facts = {**facts, "mesh for solvers": str(main.left_out)}
     words = "; ".join([f"method {name}", *(f"{k} {v}" for k, v in facts.items())])

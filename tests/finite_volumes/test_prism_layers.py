@@ -5,7 +5,7 @@ import pytest
 
 import clvoro
 from clvoro import Layers, Solid
-from clvoro.errors import InputError, InputTypeError, MismatchWarning
+from clvoro.errors import InputError, InputTypeError, MemoryLimitError, MismatchWarning
 
 HEIGHTS = 0.02 * 1.3 ** np.arange(3)
 T = HEIGHTS.sum()
@@ -52,7 +52,9 @@ def test_layers_fill_the_cube_with_the_heights_asked_for(cube):
     # One column stands on each wall polygon; all reach the full thickness.
     counts = np.bincount(d.layer, minlength=4)
     assert counts[1] == counts[2] == counts[3] > 30
-    assert "on 100 % of their walls" in cube.summary()["thickness"]
+    assert cube.summary()["thickness"] == [
+        pytest.approx({"asked": T, "min": T, "mean": T, "max": T, "full_share": 1.0}, rel=1e-12)
+    ]
     # Prisms have their own size, and error 0.
     assert np.abs(cube.size_error[d.layer > 0]).max() < 1e-12
     assert (cube.origin[d.layer > 0] == -1).all()
@@ -137,6 +139,7 @@ def test_a_mesh_with_layers_is_a_start(adapter, cube):
     ("layers", "error", "message"),
     [
         (Layers(0.1, 10), InputError, "layers leave no room"),
+        (Layers(1e-6, 40_000, 1), InputError, "expected at most 32767"),
         ([0.1], InputTypeError, "expected clvoro.Layers"),
         (Layers(0.1, edges="lid"), InputError, "lid"),
     ],
@@ -144,6 +147,18 @@ def test_a_mesh_with_layers_is_a_start(adapter, cube):
 def test_wrong_layers_are_refused(adapter, layers, error, message):
     with pytest.raises(error, match=message):
         adapter.run(Solid.box((0, 0, 0), (1, 1, 1)), 0.4, effort="fast", layers=layers)
+
+
+def test_prisms_that_memory_does_not_hold_are_refused(adapter, monkeypatch):
+    monkeypatch.setattr("clvoro.adaptation.estimates.host_memory", lambda: 2.0**20)
+    with pytest.raises(MemoryLimitError, match=r"layers have about 3e\+03 prisms, which need .* MiB; .* 1 MiB"):
+        adapter.run(Solid.box((0, 0, 0), (1, 1, 1)), 0.2, layers=Layers(1e-3, 20, 1))
+
+
+def test_walls_beside_layers_stay_on_the_surface(adapter):
+    """Vertices of a curved patch without layers follow those of its crease."""
+    pipe = Solid.cylinder((0, 0, 0), (0, 0, 2), 0.7)
+    assert adapter.run(pipe, 0.25, effort="fast", layers=Layers(0.02, 3, 1.3, edges="top")).check()
 
 
 def test_a_box_in_space_says_what_to_write(adapter):

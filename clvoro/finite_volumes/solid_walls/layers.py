@@ -16,6 +16,7 @@ from ...geometry.boundary_layers import Layers
 from ...mesh.connectivity import distinct, following, take_rows
 from ...mesh.diagram import Diagram
 from ...mesh.faces import Faces
+from ...mesh.results import thickness_in_words
 from ..gate import rejected_cells
 from .mesh import diagram_of
 
@@ -52,8 +53,8 @@ _FULL = 0.9
 """Layers count as full from this share of the thickness on."""
 
 
-def add_layers(diagram: Diagram, layers: Sequence[Layers]) -> tuple[Diagram, str]:
-    """Return the mesh of a solid with layers of prisms along patches, and how thick they are in words.
+def add_layers(diagram: Diagram, layers: Sequence[Layers]) -> tuple[Diagram, list[dict[str, float]]]:
+    """Return the mesh of a solid with layers of prisms along patches, and how thick they are.
 
     The polygons of these patches move inward by the thickness of the layers, and vertices near them follow. Between
     the polygons and the surface are the prisms. They end at patches without layers, on which their sides lie.
@@ -72,7 +73,8 @@ def add_layers(diagram: Diagram, layers: Sequence[Layers]) -> tuple[Diagram, str
     -------
     diagram : Diagram
         The cells of `diagram`, then the prisms, polygon by polygon, the innermost first. Its `layer` says which one.
-    reached : str
+    thickness : list of dict
+        How thick each of `layers` is; see `clvoro.mesh.results.thickness_in_words`.
 
     Warns
     -----
@@ -412,7 +414,7 @@ class _LayeredWalls:
         walls[rows] = self._onto_patches(rows, walls[rows] + slid[rows])
         moved += x
         moved[self.vertices] = walls + way + (whole - above)
-        rows = np.flatnonzero(self.border)
+        rows = np.flatnonzero(self.border | (~self.column & (whole != above).any(axis=1)))
         moved[self.vertices[rows]] = self._onto_patches(rows, moved[self.vertices[rows]], bare=True)
         return moved, walls
 
@@ -597,8 +599,8 @@ class _LayeredWalls:
         of_prisms = self.corners[np.isin(self.face, made.wall[np.flatnonzero(bad[n:])])]
         return _RejectedCells(int(bad.sum()), distinct(np.concatenate([of_prisms, found[found >= 0]])))
 
-    def reached(self, share: np.ndarray, layers: Sequence[Layers]) -> str:
-        """Return in words how thick the `layers` are; `share` (u,) is that at vertices. Warn where they are thin."""
+    def reached(self, share: np.ndarray, layers: Sequence[Layers]) -> list[dict[str, float]]:
+        """Return how thick the `layers` are; `share` (u,) is that at vertices. Warn where they are thin."""
         sums = np.add.reduceat(share[self.corners], self.starts[:-1])
         mean = sums / np.diff(self.starts)
         area, center, found = self.faces.area[self.rows], self.faces.center[self.rows], []
@@ -607,19 +609,23 @@ class _LayeredWalls:
             part, weight, thick = mean[rows], area[rows], layer.thickness
             full = float(weight[part >= _FULL].sum() / weight.sum())
             average = float((part * weight).sum() / weight.sum())
-            found.append(
-                f"layers[{k}] are {thick * part.min():.3g} to {thick * part.max():.3g} thick, {thick * average:.3g} in "
-                f"the mean, and {thick:.3g} on {100 * full:.3g} % of their walls"
-            )
+            least, most = thick * float(part.min()), thick * float(part.max())
+            found.append({"asked": thick, "min": least, "mean": thick * average, "max": most, "full_share": full})
             if part.min() < _FULL:
                 place = format_point(center[rows[part.argmin()]])
+                remedy = (
+                    "Use thinner layers or smaller cells there, or give the patches around them layers, too"
+                    if most > 0
+                    else "On curved walls each layer must be higher than a polygon of the wall bends: use thicker "
+                    "layers or smaller cells"
+                )
                 warn(
-                    f"{found[-1]}: {np.count_nonzero(part < _FULL)} of {len(rows)} wall polygons have thinner ones, or "
-                    f"none, because of gaps, sharp edges or borders, the thinnest at {place}. Use thinner layers or "
-                    "smaller cells there, or give the patches around them layers, too",
+                    f"{thickness_in_words(found)[k]}: {np.count_nonzero(part < _FULL)} of {len(rows)} wall polygons "
+                    "have thinner ones, or none, because of gaps, sharp edges or borders, or curved walls, the "
+                    f"thinnest at {place}. {remedy}",
                     MismatchWarning,
                 )
-        return "; ".join(found)
+        return found
 
 
 def _sums(rows: np.ndarray, values: np.ndarray) -> np.ndarray:
