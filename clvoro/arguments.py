@@ -225,8 +225,8 @@ def check_number(name: str, value: object, *, above: float = -np.inf, least: flo
     except OverflowError:
         number = np.inf
     if not np.isfinite(number) or number <= above or number < least:
-        bound = f"> {above:g}" if above > -np.inf else f">= {least:g}"
-        raise InputError(f"{name} is {value!r}, expected a finite number {bound}")
+        bound = f" > {above:g}" if above > -np.inf else f" >= {least:g}" if least > -np.inf else ""
+        raise InputError(f"{name} is {value!r}, expected a finite number{bound}")
     return number
 
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
+import io
 import warnings
 import zipfile
 from collections.abc import Callable, Iterable, Sequence
@@ -12,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .arguments import check_path
+from .arguments import check_number, check_path
 from .earth.netcdf_read import Variables, lonlat_names, open_netcdf
 from .errors import InputError, InputTypeError, MismatchWarning
 from .files import open_plain
@@ -34,6 +36,7 @@ _NEAR_WALL = 1e-3
 """Places beyond a wall by less than this share of the domain are on it: walls of other meshes are facets of curves."""
 _NETCDF, _TABLES = (".nc", ".nc4", ".cdf", ".netcdf"), (".csv", ".txt", ".dat", ".tsv")
 _AXES = (("x", "y", "z"), ("lon", "lat"), ("longitude", "latitude"))
+_MPAS_PLACES = ("xCell", "yCell", "zCell", "lonCell", "latCell")
 
 
 class _Found(NamedTuple):
@@ -101,9 +104,8 @@ def read_fields(
         If the places cover little of the domain.
     """
     name = check_path("path", path)
-    wanted = (fields,) if isinstance(fields, str) else None if fields is None else tuple(fields)
-    if wanted is not None and not (wanted and all(isinstance(one, str) for one in wanted)):
-        raise InputTypeError(f"fields is {fields!r:.60}, expected names of fields, or None for all")
+    wanted = _names(fields)
+    time = None if time is None else check_number("time", time)
     with explained(name, "a file with fields"):
         found = _reader(Path(name))(Path(name), wanted, time)
     mesh, values = _on_mesh(name, found, domain)
@@ -115,6 +117,15 @@ def read_fields(
                 f"({len(bad)} of {len(rows)} are not); leave these rows out, or go back to an earlier time"
             )
     return mesh, values
+
+
+def _names(fields: object) -> tuple[str, ...] | None:
+    if fields is None:
+        return None
+    names = (fields,) if isinstance(fields, str) else tuple(fields) if isinstance(fields, Iterable) else ()
+    if not (names and all(isinstance(one, str) for one in names)):
+        raise InputTypeError(f"fields is {fields!r:.60}, expected names of fields, or None for all")
+    return names
 
 
 def _reader(path: Path) -> Callable[[Path, tuple[str, ...] | None, float | None], _Found]:
@@ -156,7 +167,8 @@ def _one_time(time: float | None) -> None:
 
 def _of_clvoro(path: Path, wanted: tuple[str, ...] | None, time: float | None) -> _Found:
     _one_time(time)
-    mesh = load(path)
+    made = load(path)
+    mesh = made.diagram if isinstance(made, Result) else made
     if path.suffix.lower() == ".npz":
         with zipfile.ZipFile(path) as archive:
             names = [n.removesuffix(".npy") for n in archive.namelist()]
@@ -164,8 +176,14 @@ def _of_clvoro(path: Path, wanted: tuple[str, ...] | None, time: float | None) -
         values = {n: read_array(path, there[n]).astype(float) for n in _chosen(wanted, there)}
     else:
         values = cell_data_of_vtu(path, wanted) or {}
-        values = {n: values[n] for n in _chosen(wanted, values)}
-    return _Found(values, mesh=mesh.diagram if isinstance(mesh, Result) else mesh)
+        there = values if wanted is None or len(values) == len(set(wanted)) else cell_data_of_vtu(path, None) or {}
+        values = {n: values[n] for n in _chosen(wanted, {**values, **there})}
+    return _Found({n: _of_dimension(rows, mesh.domain.dim) for n, rows in values.items()}, mesh=mesh)
+
+
+def _of_dimension(rows: np.ndarray, dim: int) -> np.ndarray:
+    """Return vectors without the third component 0 that VTK has in the plane."""
+    return rows[:, :dim] if rows.ndim > 1 and rows.shape[1] == 3 and not rows[:, dim:].any() else rows
 
 
 def _of_openfoam(path: Path, wanted: tuple[str, ...] | None, time: float | None) -> _Found:
@@ -198,38 +216,62 @@ def _domain_of(foam: FoamMesh) -> Domain | None:
 def _of_table(path: Path, wanted: tuple[str, ...] | None, time: float | None) -> _Found:
     _one_time(time)
     with open_plain(path) as file:
-        lines = file.read().decode("utf-8-sig").splitlines()
+        try:
+            lines = file.read().decode("utf-8-sig").splitlines()
+        except UnicodeDecodeError as error:
+            raise FileError("it is no text in UTF-8; save it as text in UTF-8, with numbers in columns") from error
     lines = [line.lstrip("#% ") if k == 0 else line for k, line in enumerate(lines) if line.strip()]
     if len(lines) < 2:
         raise FileError(f"it has {len(lines)} lines, expected names in the first one, and rows of numbers")
     mark = next((m for m in (",", ";", "\t") if m in lines[0]), None)
     rows = list(csv.reader(lines, delimiter=mark)) if mark else [line.split() for line in lines]
     names = [name.strip() for name in rows[0]]
+    other = next((row for row in rows[1:] if len(row) != len(names)), None)
+    if other is not None:
+        raise FileError(
+            f"its row {', '.join(other)!r:.60} has {len(other)} items, expected {len(names)} numbers for the names in "
+            "the first line"
+        )
+    columns = dict(zip(names, zip(*rows[1:], strict=True), strict=True))
+    if not any(columns.get("", ())):  # a separator at the end of each line
+        columns.pop("", None)
+    twice = [name for name in columns if names.count(name) > 1]
+    if twice:
+        raise FileError(f"it has two columns {twice[0]!r}, expected one for each name")
+    return _of_columns(columns, wanted)
+
+
+def _numbers(name: str, column: Sequence[str] | np.ndarray) -> np.ndarray:
+    """Return a column of a table as float64."""
     try:
-        table = np.array([[float(item) for item in row] for row in rows[1:]])
+        return np.array(column, float)
     except ValueError as error:
-        raise FileError(f"its rows are not numbers of one count ({error}), expected {len(names)} in each") from error
-    if table.ndim != 2 or table.shape[1] != len(names):
-        raise FileError(f"its rows have shape {table.shape}, expected {len(names)} numbers for the names in line 1")
-    return _of_columns(dict(zip(names, table.T, strict=True)), wanted)
+        raise FileError(f"its column {name} has other items than numbers ({error}), expected numbers only") from error
 
 
-def _of_columns(columns: dict[str, np.ndarray], wanted: tuple[str, ...] | None) -> _Found:
-    """Return the values beside the columns x, y (, z) or lon, lat. ParaView writes Points:0 and U:0, U:1, U:2."""
-    split: dict[str, list[np.ndarray]] = {}
-    for name, column in columns.items():
-        base, sign, number = name.rpartition(":")
-        split.setdefault(base if sign and number.isdigit() else name, []).append(column)
-    values = {n: parts[0] if len(parts) == 1 else np.stack(parts, axis=1) for n, parts in split.items()}
-    if "Points" in values and values["Points"].ndim == 2:
-        places = values.pop("Points")
-        return _Found({n: values[n] for n in _chosen(wanted, values)}, places)
-    lower = {name.lower(): name for name in values}
+def _of_columns(columns: dict[str, tuple[str, ...]], wanted: tuple[str, ...] | None) -> _Found:
+    """Return the values beside the columns x, y (, z) or lon, lat.
+
+    ParaView writes Points:0 and U:0, U:1, U:2, or Points_0 and U_0, U_1, U_2.
+    """
+    mark, split = "_" if "Points_0" in columns else ":", dict[str, list[str]]()
+    for name in columns:
+        base, sign, number = name.rpartition(mark)
+        split.setdefault(base if sign and number.isdigit() else name, []).append(name)
+
+    def take(name: str) -> np.ndarray:
+        parts = [_numbers(one, columns[one]) for one in split.pop(name)]
+        return parts[0] if len(parts) == 1 else np.stack(parts, axis=1)
+
+    if len(split.get("Points", ())) > 1:
+        places = take("Points")
+        return _Found({n: take(n) for n in dict.fromkeys(_chosen(wanted, split))}, places)
+    lower = {name.lower(): name for name in split}
     for axes in _AXES:
         along = [lower[axis] for axis in axes if axis in lower]
-        if len(along) >= 2 and all(values[n].ndim == 1 for n in along):
-            places = np.stack([values.pop(n) for n in along], axis=1)
-            return _Found({n: values[n] for n in _chosen(wanted, values)}, places, axes[0] != "x")
+        if len(along) >= 2 and all(len(split[n]) == 1 for n in along):
+            places = np.stack([take(n) for n in along], axis=1)
+            return _Found({n: take(n) for n in dict.fromkeys(_chosen(wanted, split))}, places, axes[0] != "x")
     raise FileError(f"it has the columns {', '.join(columns):.300}, expected x, y (, z) or lon, lat among them")
 
 
@@ -240,15 +282,28 @@ def _of_arrays(path: Path, wanted: tuple[str, ...] | None, time: float | None) -
     if "points" not in names:
         raise FileError(f"it has the arrays {', '.join(names):.300}, expected points (n, d) among them")
     places = read_array(path, "points").astype(float)
-    chosen = _chosen(wanted, [name for name in names if name != "points"])
-    return _Found({name: read_array(path, name).astype(float) for name in chosen}, places)
+    names.remove("points")
+    values = {name: read_array(path, name) for name in names if wanted is None or name in wanted}
+    if wanted is None:  # without numbers of the whole, and texts
+        values = {name: rows for name, rows in values.items() if rows.ndim and rows.dtype.kind not in "SU"}
+    values = {name: values[name] for name in _chosen(wanted, values if wanted is None else names)}
+    for name, rows in values.items():
+        if rows.dtype.kind not in "biuf" or not rows.ndim or not rows[:1].size:
+            raise FileError(f"{name} has shape {rows.shape} and dtype {rows.dtype}, expected (n,) or (n, k) numbers")
+    return _Found({name: rows.astype(float) for name, rows in values.items()}, places)
 
 
 def _of_netcdf(path: Path, wanted: tuple[str, ...] | None, time: float | None) -> _Found:
     with open_netcdf(path) as file:
         there = {name: found for name in file.names() if (found := _coordinates(file, name))}
-        axes = {name for axes, _, _ in there.values() for name in axes}
-        present = [name for name in there if name not in axes and file.is_real(name)]
+        axes = {name for axes, _, _ in there.values() for name in axes}.union(_MPAS_PLACES)
+        kinds = "f" if wanted is None else "iuf"
+        present = [name for name in there if name not in axes and file.kind(name) in kinds]
+        if not present:
+            raise FileError(
+                "it has no fields by UGRID or MPAS, nor with the attribute coordinates; for sizes on a grid of "
+                'longitudes and latitudes take Raster, or kind = "raster" in a case file'
+            )
         values, used = {}, []
         for name in _chosen(wanted, present):
             names, along, on_globe = there[name]
@@ -260,7 +315,7 @@ def _of_netcdf(path: Path, wanted: tuple[str, ...] | None, time: float | None) -
         places = np.stack([file.data(name) for name in names], axis=1)
         if names[0] == "lonCell":
             places = np.degrees(places)
-    kept = ~np.any([np.isnan(v.reshape(len(v), -1)).any(axis=1) for v in values.values()], axis=0)
+    kept = ~np.any([np.isnan(v.reshape(len(v), -1)).any(axis=1) for v in (places, *values.values())], axis=0)
     if not kept.any():
         raise FileError(f"its fields {', '.join(values)} have no values")
     return _Found({name: v[kept] for name, v in values.items()}, places[kept], on_globe)
@@ -269,9 +324,10 @@ def _of_netcdf(path: Path, wanted: tuple[str, ...] | None, time: float | None) -
 def _coordinates(file: Variables, name: str) -> tuple[tuple[str, ...], str, bool] | None:
     """Return the coordinates of a variable, the dimension along them, and whether they are on a globe; else None."""
     dims = file.dimensions(name)
-    if "nCells" in dims and "xCell" in file:
-        sphere = str(file.attribute("on_a_sphere")).strip().upper() == "YES"
-        return (("lonCell", "latCell") if sphere else ("xCell", "yCell")), "nCells", sphere
+    sphere = str(file.attribute("on_a_sphere")).strip().upper() == "YES"
+    cells = ("lonCell", "latCell") if sphere else ("xCell", "yCell")
+    if "nCells" in dims and all(one in file for one in cells):
+        return cells, "nCells", sphere
     texts = [file.about(name, "coordinates")]
     mesh = file.about(name, "mesh")
     if mesh is not None and mesh in file:
@@ -294,8 +350,10 @@ def _at_time(file: Variables, name: str, along: str, time: float | None) -> np.n
     for k, dim in enumerate(dims):
         if dim.lower() == "time":
             count, at = values.shape[k], -1 if time is None else time
-            if not (count and at == int(at) and -1 <= at < count):
-                raise FileError(f"{name} has {count} times, and time is {time}; expected 0 to {count - 1}")
+            if not count:
+                raise FileError(f"{name} has no times; wait until its program has written one")
+            if not (at == int(at) and -1 <= at < count):
+                raise FileError(f"{name} has {count} times, and time is {time:g}; expected 0 to {count - 1}")
             values, dims = values.take(int(at), axis=k), dims[:k] + dims[k + 1 :]
             break
     else:
@@ -316,11 +374,14 @@ def _of_meshio(path: Path, wanted: tuple[str, ...] | None, time: float | None) -
             "it needs the package meshio: run `pip install 'clvoro[formats]'`, or write a table of points, .csv with "
             "the columns x, y (, z)"
         ) from error
+    said = io.StringIO()
     try:
-        mesh = meshio.read(path)
+        with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
+            mesh = meshio.read(path)
     except (Exception, SystemExit) as error:
+        why = str(error) if isinstance(error, Exception) else " ".join(said.getvalue().split())
         raise FileError(
-            f"meshio cannot read it ({error!s:.200}); write a table of points, .csv with the columns x, y (, z), as "
+            f"meshio cannot read it ({why:.200}); write a table of points, .csv with the columns x, y (, z), as "
             "ParaView does with its filter Cell Centers"
         ) from error
     top = max((block.dim for block in mesh.cells), default=0)
@@ -353,8 +414,14 @@ def _on_mesh(name: str, found: _Found, domain: Domain | None) -> tuple[Diagram, 
         given = "none" if domain is None else f"a {type(domain).__name__}"
         raise InputTypeError(f"domain is {given}, expected that to be adapted; give it, because {name} has none")
     assert found.places is not None
-    if found.places.ndim != 2 or not np.isfinite(found.places).all():
-        raise InputError(f"{name} has points of shape {found.places.shape}, expected (n, {domain.dim}) finite numbers")
+    if found.places.ndim != 2 or not len(found.places):
+        raise InputError(f"{name} has points of shape {found.places.shape}, expected (n, {domain.dim}) numbers")
+    bad = np.flatnonzero(~np.isfinite(found.places).all(axis=1))
+    if len(bad):
+        raise InputError(
+            f"{name} has a point {found.places[bad[0]].tolist()}, expected finite numbers ({len(bad)} of "
+            f"{len(found.places)} are not); leave these rows out"
+        )
     x = domain.placed(name, found.places, found.on_globe)
     for key, rows in found.values.items():
         if len(rows) != len(x):
@@ -377,9 +444,7 @@ def _on_mesh(name: str, found: _Found, domain: Domain | None) -> tuple[Diagram, 
     share = 1 / np.bincount(cell, minlength=count)
     values = {}
     for one, rows in found.values.items():
-        columns = rows[near].reshape(len(x), -1)
-        if columns.shape[1] == domain.dim + 1 and not columns[:, -1].any():
-            columns = columns[:, :-1]  # VTK has vectors in space
+        columns = _of_dimension(rows[near].reshape(len(x), -1), domain.dim)
         mean = np.stack([np.bincount(cell, column, count) * share for column in columns.T], axis=1)
         values[one] = mean[:, 0] if rows.ndim == 1 else mean
     mesh = voronoi(domain, x[first])

@@ -95,7 +95,7 @@ def test_fields_in_the_plane(mesh, tmp_path, name, write):
     write(tmp_path / name, mesh)
     found, values = clvoro.read_fields(tmp_path / name, ["u", "w"], domain=SQUARE)
     x = found.centroids
-    assert values["w"][:, :2] == pytest.approx(x, abs=1e-9)
+    assert values["w"] == pytest.approx(x, abs=1e-9)
     assert values["u"] == pytest.approx(bent(x), abs=1e-9)
     bend = sizing.derivatives(values["u"], found)[1]
     assert bend == pytest.approx(np.tile([[0.0, -2], [-2, 6]], (len(x), 1, 1)), abs=1e-8)
@@ -165,13 +165,21 @@ def test_times_and_missing_values(tmp_path):
 
 def table(text, **options):
     def call(tmp_path):
-        (tmp_path / "f.csv").write_text(text)
+        (tmp_path / "f.csv").write_bytes(text.encode(options.pop("encoding", "utf-8")))
         return clvoro.read_fields(tmp_path / "f.csv", **{"domain": SQUARE, **options})
 
     return call
 
 
-POINTS = "\n".join(f"{x},{y},{x + y}" for x in (0.1, 0.5, 0.9) for y in (0.2, 0.5, 0.8))
+def arrays(**given):
+    def call(tmp_path):
+        np.savez(tmp_path / "f.npz", **given)
+        return clvoro.read_fields(tmp_path / "f.npz", domain=SQUARE)
+
+    return call
+
+
+POINTS = "\n".join(f"{x},{y},{x + y}" for x in (0.1, 0.5, 0.9) for y in (0.1, 0.5, 0.9))
 
 
 @pytest.mark.parametrize(
@@ -182,15 +190,24 @@ POINTS = "\n".join(f"{x},{y},{x + y}" for x in (0.1, 0.5, 0.9) for y in (0.2, 0.
         (table("x,y,u\n" + POINTS, time=2), InputError, "it has no times, and time is 2; leave it out"),
         (table("x,y,u\n" + POINTS, fields=[]), InputTypeError, "expected names of fields"),
         (table("a,b,u\n" + POINTS), InputError, "expected x, y .* or lon, lat among them"),
-        (table("x,y\n" + POINTS), InputError, "expected 2 numbers|shape"),
+        (table("x,y\n" + POINTS), InputError, "row '0.1, 0.1, 0.2.*' has 3 items, expected 2 numbers"),
         (table("x,y,u\n1,2\n"), InputError, "expected 3 numbers"),
-        (table("x,y,u\n1,2,three\n"), InputError, "its rows are not numbers"),
+        (table("x,y,u\n1,2,three\n"), InputError, "column u has other items than numbers .*three"),
+        (table("x,y,x\n" + POINTS), InputError, "two columns 'x', expected one"),
+        (table("x,y,u\n" + POINTS, encoding="utf-16"), InputError, "no text in UTF-8; save it"),
+        (table("x,y,u\nnan,0.5,1\n" + POINTS), InputError, r"has a point \[nan, 0.5\], expected finite .*1 of 10"),
+        (table("x,y,u\n" + POINTS, fields=3), InputTypeError, "expected names of fields"),
+        (table("x,y,u\n" + POINTS, time=np.nan), InputError, "time is nan, expected a finite number$"),
+        (arrays(points=np.zeros((0, 2)), u=np.zeros((0, 1))), InputError, "u has shape|points of shape"),
+        (arrays(points=grid(2), u=3.0), InputError, "no field at all"),
+        (arrays(points=grid(2), u=np.zeros((81, 0))), InputError, r"u has shape \(81, 0\)"),
+        (arrays(points=grid(2), u=np.ones(81) * 1j), InputError, "dtype complex128, expected"),
         (table("x,y,u\n0,0,nan\n1,1,3\n" + POINTS), InputError, r"u is nan at \[0.0, 0.0\], expected finite values"),
         (table("x,y,u\n" + POINTS, domain=clvoro.Box((100, 0), (200, 1))), InputError, "of which 0 are in Box"),
         (table("x,y,u\n" + POINTS, domain=CUBE), InputError, "points with 2 coordinates, expected 3"),
         (table("lon,lat,u\n" + POINTS, domain=CUBE), InputError, "expected 3 in"),
         (lambda folder: clvoro.read_fields(folder / "none.vtu", domain=SQUARE), InputError, "No such file"),
-        (lambda folder: clvoro.read_fields(folder, domain=SQUARE), InputError, "system/controlDict"),
+        (lambda folder: clvoro.read_fields(folder, domain=SQUARE), InputError, "^/.* has no system/controlDict"),
         (lambda folder: clvoro.read_fields(3, domain=SQUARE), InputTypeError, "name of a file"),
     ],
 )
@@ -199,13 +216,35 @@ def test_bad_files_are_refused(tmp_path, call, kind, text):
         call(tmp_path)
 
 
-def test_files_that_are_damaged(tmp_path):
+def test_tables_of_other_programs(tmp_path):
+    """A separator at the end of lines, texts in other columns, and both names that ParaView gives to components."""
+    rows = POINTS.split("\n")
+    labels = "x;y;u;part;\n" + "\n".join(row.replace(",", ";") + ";wall;" for row in rows)
+    for mark in ":_":
+        head = f"Points{mark}0,Points{mark}1,U{mark}0,U{mark}1\n"
+        x = table(head + "\n".join(f"{row},1" for row in rows), fields="U")(tmp_path)[1]["U"]
+        assert x.tolist() == [[u, 1] for u in x[:, 0]]
+        found, values = table(labels, fields="u")(tmp_path)
+        assert values["u"].tolist() == x[:, 0].tolist() == pytest.approx(found.points.sum(axis=1))
+
+
+def test_files_that_are_damaged(tmp_path, capfd):
     for name in ("f.vtu", "f.nc", "f.npz", "f.vtk", "f.msh"):
         (tmp_path / name).write_bytes(b"\x00what is this?")
         with pytest.raises(ClvoroError, match=f"cannot load .*{name}"):
             clvoro.read_fields(tmp_path / name, domain=SQUARE)
+    assert capfd.readouterr() == ("", "")
+
+
+def test_names_in_files_of_clvoro(mesh, tmp_path):
+    """An error has all names; whole numbers are read by name."""
+    for name in ("mesh.vtu", "mesh.npz", "mesh.nc"):
+        mesh.save(tmp_path / name, cell_data={"u": mesh.volumes, "k": np.arange(len(mesh))})
+        assert set(clvoro.read_fields(tmp_path / name, "k", domain=SQUARE)[1]["k"]) == set(range(len(mesh)))
+        with pytest.raises(InputError, match=r"it has no field v; it has .*k"):
+            clvoro.read_fields(tmp_path / name, ["u", "v"], domain=SQUARE)
 
 
 def test_fields_that_cover_little_are_warned_of(tmp_path):
-    with pytest.warns(MismatchWarning, match="covers 0.05"):
+    with pytest.warns(MismatchWarning, match="covers 0.07"):
         table("x,y,u\n" + POINTS, domain=clvoro.Box((0, 0), (3, 3)))(tmp_path)

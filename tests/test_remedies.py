@@ -902,6 +902,10 @@ ROWS = [
         lambda t: clvoro.read_fields(t.fields(np.column_stack([POINTS, POINTS[:, 0]])), domain=CUBE),
     ),
     (
+        lambda t: clvoro.read_fields(t.fields(np.full((30, 2), np.nan), u=POINTS[:, 0]), domain=BOX),
+        lambda t: clvoro.read_fields(t.fields(POINTS, u=POINTS[:, 0]), domain=BOX),
+    ),
+    (
         lambda t: clvoro.read_fields(t.fields(POINTS, u=np.full(30, np.nan)), domain=BOX),
         lambda t: clvoro.read_fields(t.fields(POINTS, u=POINTS[:, 0]), domain=BOX),
     ),
@@ -1004,6 +1008,8 @@ ROWS = [
 
 
 TESTED_IN = {
+    "has one value in all cells of the latest time": "foam/test_foam_cases.py::test_bad_input_changes_nothing",
+    "U enters the domain with": "foam/test_foam_cases.py::test_bad_input_changes_nothing",
     "this process was forked": "robustness/test_unattended.py::test_forked_processes_are_told_that_they_cannot_work",
     "as much, since its values": "foam/test_foam_cases.py::test_bad_input_changes_nothing",
     "cells meet at a vertex": "tessellation/test_vertices.py::test_walks_around_a_vertex_end",

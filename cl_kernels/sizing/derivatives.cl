@@ -16,16 +16,18 @@
 inline void choose_basis(global const REAL *normal, REAL *basis)
 {
 #ifdef SPHERE
-    const REAL3 n = normalize((REAL3)(normal[0], normal[1], normal[2]));
+    REAL3 n = (REAL3)(normal[0], normal[1], normal[2]);
+    n /= sqrt(dot(n, n));
     const REAL3 size = fabs(n);
     REAL3 axis = (REAL3)(0, 0, 1);
     if (size.x <= size.y && size.x <= size.z)
         axis = (REAL3)(1, 0, 0);
     else if (size.y <= size.z)
         axis = (REAL3)(0, 1, 0);
-    const REAL3 first = normalize(axis - dot(axis, n) * n), second = cross(n, first);
+    REAL3 first = axis - dot(axis, n) * n;
+    first /= sqrt(dot(first, first));
     vstore3(first, 0, basis);
-    vstore3(second, 1, basis);
+    vstore3(cross(n, first), 1, basis);
 #else
     for (int a = 0; a < CELL_DIM * DIM; ++a)
         basis[a] = a / DIM == a % DIM;

@@ -189,10 +189,10 @@ class Variables:
         """Return the names of the dimensions of a variable."""
         return tuple(self._file.variables[name].dimensions)
 
-    def is_real(self, name: str) -> bool:
-        """Whether a variable has real numbers."""
+    def kind(self, name: str) -> str:
+        """Return the kind of a variable's type, as of `numpy.dtype`."""
         found = self._file.variables[name]
-        return (found.dtype if hasattr(found, "dtype") else found.data.dtype).kind == "f"
+        return np.dtype(found.dtype if hasattr(found, "dtype") else found.data.dtype).kind
 
     def data(self, name: str) -> np.ndarray:
         """Return a variable as float64, scaled, with NaN where it has no value."""

@@ -231,9 +231,7 @@ class FoamCase:
         ClvoroError
             If it fails; with the end of the log.
         """
-        words = solver.split()
-        if not words or shutil.which(words[0]) is None:
-            raise InputError(f"solver is {solver!r}, which is not on the PATH; load OpenFOAM's environment first")
+        words = check_solver(solver)
         environment = {"WM_PROJECT_DIR": _HOME, **os.environ}
         with open(log, "wb") as file:
             code = subprocess.run(
@@ -252,6 +250,20 @@ class FoamCase:
             for path in sorted(max(starts, key=lambda p: float(p.name)).glob("*.dat")) if starts else []:
                 found |= {f"{function.name}.{column}": value for column, value in _last_row(path).items()}
         return found
+
+
+def check_solver(solver: str) -> list[str]:
+    """Return the words of a command, whose first one is a program.
+
+    Raises
+    ------
+    InputError
+        If it is not installed.
+    """
+    words = solver.split()
+    if not words or shutil.which(words[0]) is None:
+        raise InputError(f"solver is {solver!r}, which is not on the PATH; load OpenFOAM's environment first")
+    return words
 
 
 def _has(folder: Path, name: str) -> bool:

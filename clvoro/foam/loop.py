@@ -31,7 +31,7 @@ from ..mesh.diagram import Diagram
 from ..mesh.results import Result
 from ..shared import shared_adapter
 from ..sizing import Estimate, combine, force_weight, hessian_size, normalize, steepness
-from .case import FoamCase, Time
+from .case import FoamCase, Time, check_solver
 from .fields import FoamField, Values
 from .mesh import FoamMesh
 from .transfer import MeshOfCase, check_fluxes, fields_that_move, transfer_fields
@@ -116,7 +116,13 @@ class FieldSizes:
         """Return the estimate from values in cells, (n,) or (n, d), by the names of the fields."""
         missing = [name for name in (*self.fields, *self.adjoints) if name not in found]
         if missing:
-            raise InputError(f"the latest time has no field {missing[0]}, expected one of {', '.join(found)}")
+            there = f"one of {', '.join(found)}" if found else "fields in cells, and it has none"
+            raise InputError(f"the latest time has no field {missing[0]}, expected {there}")
+        if not any(np.ptp(found[name], axis=0).any() for name in self.fields):
+            raise InputError(
+                f"{', '.join(self.fields)} has one value in all cells of the latest time, expected a solution; run the "
+                "solver first"
+            )
         weight = None
         if self.forces:
             weight = force_weight(self.forces, on)
@@ -264,6 +270,8 @@ class _Loop:
             # Before anything is written.
             on_cycle(self._adapt(self._known(note) or self._solved(note, 0.0), note, mesh))
             return self.rows
+        if not callable(solver):
+            check_solver(solver)
         length = self._interval(interval)
         check_writable(case.folder)
         make_folder(case.own)
@@ -292,7 +300,8 @@ class _Loop:
         if not path.exists():
             return {"cycle": 0, "time": None, "layers": []}
         with explained(path, "the note of a cycle"):
-            return json.loads(path.read_text())
+            note = json.loads(path.read_text())
+            return {key: note[key] for key in ("cycle", "time", "layers", "row")}
 
     def _interval(self, given: float | None) -> float:
         if given is None:
@@ -300,7 +309,8 @@ class _Loop:
             end, begin = case.control_number("endTime"), case.control_number("startTime")
             kept = case.own / "interval"
             if kept.exists():
-                return float(kept.read_text())
+                with explained(kept, "the interval of the first call"):
+                    return float(kept.read_text())
             if end is None or end <= (begin or 0.0):
                 raise InputError(
                     f"{case.control} has no endTime after its startTime, expected both; write them, or pass interval="

@@ -12,7 +12,7 @@ from typing import cast
 
 import numpy as np
 
-from ..errors import InputError
+from ..errors import ClvoroError, InputError
 from ..files import open_plain
 from .atomic import atomic_file
 
@@ -29,10 +29,14 @@ class FileError(Exception):
 
 @contextmanager
 def explained(path: str | PathLike[str], expected: str) -> Iterator[None]:
-    """Convert all errors while reading `path` into an InputError with the file's name and the expected content."""
+    """Convert errors while reading `path` into an InputError with the file's name and the expected content."""
     name = fspath(path)
     try:
         yield
+    except ClvoroError as error:
+        if name in str(error):
+            raise
+        raise InputError(f"cannot load {name}: {error}") from error
     except FileError as problem:
         raise InputError(f"cannot load {name}: {problem}") from problem
     except zipfile.BadZipFile as error:
