@@ -26,6 +26,8 @@ THICKEST, FLATTEST, THINNEST = 3.0, 1000.0, 0.02
 """Limits of layers of prisms: all together and the first one over the size field, and the last one over it."""
 NARROWER = 0.8
 """Width of layers over the size field below which a run says so."""
+MOVED = 1e-3
+"""Way of a fixed generator over h above which a run says so."""
 SAMPLE = 64
 """Points along a layer where the sizes are compared."""
 MISSED = 0.2
@@ -162,6 +164,30 @@ def _prism_mismatches(name: str, layer: Layers, field: Field, domain: Domain) ->
     return []
 
 
+def warn_of_moved_points(fixed: np.ndarray, diagram: Diagram, sizes: np.ndarray) -> None:
+    """Warn if `fixed` generators (k, 3) have made room for layers of prisms in `diagram`.
+
+    They are the first generators of the run, whose target sizes are `sizes` (n,).
+
+    Warns
+    -----
+    MismatchWarning
+    """
+    assert diagram.home is not None
+    cells = np.flatnonzero((diagram.home >= 0) & (diagram.home < len(fixed)))
+    who = diagram.home[cells]
+    away = np.linalg.norm(diagram.points[cells] - fixed[who], axis=1)
+    moved = away > MOVED * sizes[who]
+    if moved.any():
+        k = int(away.argmax())
+        warn(
+            f"fixed[{who[k]}] at {format_point(fixed[who[k]])} has moved by {away[k]:.2g}, as its cell makes room for "
+            f"layers of prisms; {np.count_nonzero(moved)} of {len(fixed)} have moved. Use thinner layers, or none on "
+            "walls near fixed generators",
+            MismatchWarning,
+        )
+
+
 def warn_of_other_sizes(result: Result) -> None:
     """Warn if a method that keeps the number of cells ends with cells of a size far from that of the field.
 
@@ -204,7 +230,9 @@ def warn_of_errors(result: Result) -> None:
     place = diagram.domain.place_name(result.points[worst])
     near = [worst, *_ring(diagram, worst)]
     steep = any(abs(math.log(sizes[j] / sizes[i])) > math.log(STEEP) for i in near for j in _ring(diagram, i))
-    if steep and any(diagram.shifts[slice(*diagram.neighbor_starts[i : i + 2])].any() for i in near):
+    if diagram.layer[near].any():
+        why = "cells beside layers of prisms make room for them: use thinner layers there"
+    elif steep and any(diagram.shifts[slice(*diagram.neighbor_starts[i : i + 2])].any() for i in near):
         why = (
             "sizes jump at a seam of the periodic box: a field must have the period of the box; repeat its shapes one "
             "period away"

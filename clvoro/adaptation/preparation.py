@@ -65,6 +65,8 @@ class Prepared:
         Generators at the start of a moving mesh.
     levels : int
         Number of coarser levels.
+    kept_rows : (n,) int or None
+        Indices of `points` among those that the caller has given, if points in layers of a solid are left out.
     memory : float
         Estimated device memory of the run, or of reading its diagram, in bytes.
     """
@@ -78,6 +80,7 @@ class Prepared:
     target: int
     lattice: np.ndarray | None
     levels: int
+    kept_rows: np.ndarray | None
     memory: float
 
 
@@ -130,8 +133,15 @@ def prepare(
     rows, free, field = _place_layers(stages, domain, given_field, options, len(fixed))
     if domain.lines is not None:
         field = limit_beside_lines(field, place_pairs(free, domain.lines.network(free), field))
-    if points is not None and domain.extrudes_layers:
-        points = points[beyond_layers(domain, options.layers, points)]
+    kept_rows = None
+    if points is not None and domain.extrudes_layers and options.layers:
+        kept_rows = np.flatnonzero(beyond_layers(domain, options.layers, points))
+        if not kept_rows.size:
+            raise InputError(
+                f"points has {len(points)} points in the layers, expected some beyond them; give others, or leave "
+                "points out"
+            )
+        points = points[kept_rows]
     sizing = Sizing(stages.engine, domain, field, gradient_step=GRADIENT_STEP)
     # The other methods keep the number of given points.
     kept = points is not None and not options.multilevel
@@ -159,7 +169,7 @@ def prepare(
     if domain.extrudes_layers:
         check_prisms(count_prisms(domain, options.layers, lambda x: factor * sizing(x)))
     memory = _estimate_memory(setup, options, tree, required, most, levels)
-    return Prepared(options, setup, points, rows, tree, required, target, lattice, levels, memory)
+    return Prepared(options, setup, points, rows, tree, required, target, lattice, levels, kept_rows, memory)
 
 
 def _place_around(

@@ -25,7 +25,14 @@ from ..sizing.field import as_field
 from ..solvers.linear_system import Solution
 from ..tessellation.periodic.images import FewCellsError
 from .checkpoint import Checkpointer, Saved, run_fingerprint
-from .diagnostics import MISSED, warn_of_errors, warn_of_obtuse_triangles, warn_of_other_sizes, widths_of_layers
+from .diagnostics import (
+    MISSED,
+    warn_of_errors,
+    warn_of_moved_points,
+    warn_of_obtuse_triangles,
+    warn_of_other_sizes,
+    widths_of_layers,
+)
 from .fixed_points import check_fixed, origins, put_back
 from .motion import Displacement, Method
 from .options import Checkpoint, Options, uses
@@ -153,6 +160,7 @@ class Run:
         multilevel = self._options.multilevel
         self.schedule, self.target = planned.schedule, float(prepared.target)
         self.levels = self.level = prepared.levels
+        self._kept_rows = prepared.kept_rows
         self.n_cells = self._options.n_cells if multilevel else None
         self._tol = None if multilevel else self._options.tol
         self.n_start, self.started = self.state.n, self.state.next_label
@@ -455,12 +463,16 @@ class Run:
         size = mesh.to_host(mesh.h, mesh.domain.frame[1])
         error, quality = mesh.to_host(mesh.error), mesh.to_host(mesh.quality)
         origin, fixed = origins(labels, self.started, mesh.taken), mesh.setup.points
+        if self._kept_rows is not None:
+            origin = np.where(origin < 0, -1, self._kept_rows[origin]).astype(np.int32)
         diagram, settings = mesh.fetch_diagram(), dict(self._settings)
         if self._options.layers and self._domain.extrudes_layers:
             from ..finite_volumes.solid_walls.layers import add_layers
 
             diagram, settings["thickness"] = add_layers(diagram, self._options.layers)
-            fixed = fixed[:0]  # vertices have moved, and generators with them
+            # Vertices have moved, and generators with them.
+            warn_of_moved_points(self._fixed, diagram, size)
+            fixed = fixed[:0]
         if (home := diagram.home) is not None:
             # Cells may have been cut along creases: further parts come last. Generators in thin places may have none.
             own, home = home >= 0, np.where(home < 0, -1 - home, home)

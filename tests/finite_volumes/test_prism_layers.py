@@ -131,8 +131,30 @@ def test_curved_walls_keep_the_thickness(adapter):
 
 
 def test_a_mesh_with_layers_is_a_start(adapter, cube):
-    again = adapter.run(cube.domain, 0.25, points=cube.points, layers=Layers(0.02, 3, 1.3, edges=["xMin", "zMax"]))
+    again = adapter.run(
+        cube.domain, 0.25, points=cube.points[::-1], layers=Layers(0.02, 3, 1.3, edges=["xMin", "zMax"])
+    )
     assert abs((again.layer == 0).sum() / (cube.layer == 0).sum() - 1) < 0.1
+    # Points in layers are left out; `origin` counts them.
+    there = again.origin >= 0
+    assert there.any()
+    assert (cube.layer[::-1][again.origin[there]] == 0).all()
+
+
+def test_points_in_layers_only_are_refused(adapter):
+    with pytest.raises(InputError, match="points has 1 points in the layers, expected some beyond them"):
+        adapter.run(Solid.box((0, 0, 0), (1, 1, 1)), 0.3, points=[[0.01, 0.5, 0.5]], layers=Layers(0.02))
+
+
+def test_fixed_generators_that_make_room_for_layers_are_told(adapter):
+    with pytest.warns(MismatchWarning, match=r"fixed\[1\] at \(0.16, 0.5, 0.5\) has moved by .* 2 of 2 have moved"):
+        adapter.run(
+            Solid.box((0, 0, 0), (1, 1, 1)),
+            0.3,
+            effort="fast",
+            layers=Layers(0.02, 2),
+            fixed=[[0.5, 0.5, 0.5], [0.16, 0.5, 0.5]],
+        )
 
 
 @pytest.mark.parametrize(
