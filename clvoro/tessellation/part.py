@@ -166,7 +166,7 @@ class Part:
         engine.run_each(order, t.n, *given, *measures, *(engine.period_args if t.vertices else ()))
 
     def forward(self, engine: Engine, values: cla.Array) -> None:
-        """Fill the rows of ghosts in `values` (count, ...), of any type, with the values of their owners.
+        """Fill the rows of ghosts in `values` (count, ...), of whole 32-bit words, with the values of their owners.
 
         Rows of ghosts without owner stay as they are.
         """

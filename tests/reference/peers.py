@@ -28,7 +28,10 @@ class Threads:
 
 
 def run_parts(count, work):
-    """Call ``work(peers)`` in `count` threads, and return the results in their order; the first error is raised."""
+    """Call ``work(peers)`` in `count` threads, and return the results in their order.
+
+    The first error is raised, or that they wait for each other in vain.
+    """
     barrier, table, results, errors = threading.Barrier(count), [None] * count, [None] * count, []
 
     def run(number):
@@ -47,4 +50,6 @@ def run_parts(count, work):
         thread.join()
     if errors:
         raise errors[0]
+    if barrier.broken:
+        raise TimeoutError(f"a part waited for others for {WAIT:g} s, expected as many calls of all of them")
     return results
