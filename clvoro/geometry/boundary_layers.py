@@ -383,7 +383,8 @@ def count_prisms(domain: Domain, layers: Sequence[Layers], size: Callable[[np.nd
     for layer in layers:
         walls = cast("Surface", domain.boundary(layer.edges))
         h = np.asarray(size(walls.landmarks(float(domain.extent.min()) / 8, _SAMPLE)), float)
-        total += layer.count * float(walls.areas.sum()) * float((h**-2).mean())
+        area = float(np.linalg.norm(np.cross(*np.diff(walls.corners, axis=1).swapaxes(0, 1)), axis=1).sum()) / 2
+        total += layer.count * area * float((h**-2).mean())
     return total
 
 

@@ -174,7 +174,7 @@ def test_wrong_layers_are_refused(adapter, layers, error, message):
 def test_prisms_that_memory_does_not_hold_are_refused(adapter, monkeypatch):
     monkeypatch.setattr("clvoro.adaptation.estimates.host_memory", lambda: 2.0**20)
     with pytest.raises(MemoryLimitError, match=r"layers have about 3e\+03 prisms, which need .* MiB; .* 1 MiB"):
-        adapter.run(Solid.box((0, 0, 0), (1, 1, 1)), 0.2, layers=Layers(1e-3, 20, 1))
+        adapter.run(Solid.box((0, 0, 0), (1e-3, 1e-3, 1e-3)), 2e-4, layers=Layers(1e-6, 20, 1))
 
 
 def test_walls_beside_layers_stay_on_the_surface(adapter):
