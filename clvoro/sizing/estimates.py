@@ -193,7 +193,8 @@ def _free_of_rounding(found: np.ndarray, field: np.ndarray, stencils: CellStenci
     lengths = np.full(n, np.inf)
     np.minimum.at(lengths, stencils.owners, stencils.lengths)
     noise = 64 * np.finfo(float).eps * np.abs(field).max()
-    return np.where(found * lengths**order > noise, found, 0.0)
+    with np.errstate(invalid="ignore"):  # 0 times infinity in a cell without neighbors
+        return np.where(found * lengths**order > noise, found, 0.0)
 
 
 def _scaled(found: np.ndarray, volumes: np.ndarray, power: float) -> np.ndarray:

@@ -1,6 +1,7 @@
 """Fields on cells, derivatives on the neighbor graph, and sizes from a solution."""
 
 import math
+import warnings
 
 import numpy as np
 import pytest
@@ -295,3 +296,10 @@ def test_combinations_and_numbers(fine):
 def test_bad_input_is_refused(meshes, call, kind, text):
     with pytest.raises(kind, match=text):
         call(meshes["box"])
+
+
+def test_a_cell_without_neighbors_has_the_largest_size():
+    mesh = clvoro.voronoi(clvoro.Box((0, 0), (1, 1)), [(0.3, 0.5)])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert sizing.hessian_size([1.0], on=mesh, eps=0.01, h_max=0.2).values.tolist() == [0.2]
