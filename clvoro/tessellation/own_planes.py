@@ -161,7 +161,7 @@ class SurfaceSearch:
             engine.kernels("tessellation/own_planes", {"MOST_OWN": MOST_OWN}).find_nearest_triangles,
             len(points),
             engine.upload((points - origin) / scale),
-            engine.upload(np.broadcast_to(np.minimum(reach, np.finfo(np.float32).max / 4) / scale, len(points))),
+            engine.upload(np.broadcast_to(np.minimum(reach / scale, float(np.finfo(np.float32).max) / 4), len(points))),
             *self._walls.arguments(engine, self._frame),
             *self._walls.tree_arguments(engine, self._frame),
             found,

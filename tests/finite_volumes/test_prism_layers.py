@@ -183,6 +183,13 @@ def test_walls_beside_layers_stay_on_the_surface(adapter):
     assert adapter.run(pipe, 0.25, effort="fast", layers=Layers(0.02, 3, 1.3, edges="top")).check()
 
 
+def test_a_cavity_that_is_left_out_passes_the_check(adapter):
+    block = Solid.box((0, 0, 0), (1, 1, 1)) - Solid.ball((0.5, 0.5, 0.5), 0.04)
+    mesh = adapter.run(block, 0.4, effort="fast", layers=Layers(0.02, edges="zMin"))
+    assert len(mesh.left_out) == 1
+    assert mesh.check()
+
+
 def test_a_box_in_space_says_what_to_write(adapter):
     with pytest.raises(InputTypeError, match=r"write clvoro.Solid.box\(lower, upper\)"):
         adapter.run(clvoro.Box((0, 0, 0), (1, 1, 1)), 0.4, layers=Layers(0.01))
