@@ -93,8 +93,7 @@ def on_sphere(adapter: clvoro.Adapter) -> None:
     """Make meshes on a sphere: its kernels are variants of those of the plane."""
     for effort, method in (("default", "adaptive"), ("fast", "exact"), ("fast", "coupled"), ("fast", "transport")):
         steps = 3 if method == "coupled" else None
-        mesh = adapter.run(clvoro.Sphere(1.0), 0.45, seed=5, method=method, effort=effort, max_steps=steps)
-    clvoro.sizing.derivatives(mesh.centroids, mesh)
+        adapter.run(clvoro.Sphere(1.0), 0.45, seed=5, method=method, effort=effort, max_steps=steps)
 
 
 def programs_of_all_kinds(ctx: cl.Context, dtype: str, group: int | None = 128) -> list[Source]:
