@@ -1011,7 +1011,9 @@ TESTED_IN = {
     "has one value in all cells of the latest time": "foam/test_foam_cases.py::test_bad_input_changes_nothing",
     "U enters the domain with": "foam/test_foam_cases.py::test_bad_input_changes_nothing",
     "this process was forked": "robustness/test_unattended.py::test_forked_processes_are_told_that_they_cannot_work",
-    "as much, since its values": "foam/test_foam_cases.py::test_bad_input_changes_nothing",
+    "prisms, which need": "finite_volumes/test_prism_layers.py::test_prisms_that_memory_does_not_hold_are_refused",
+    "points in the layers, expected": "finite_volumes/test_prism_layers.py::test_points_in_layers_only_are_refused",
+    "; use fewer layers": "finite_volumes/test_prism_layers.py::test_wrong_layers_are_refused",
     "cells meet at a vertex": "tessellation/test_vertices.py::test_walks_around_a_vertex_end",
 }
 """Parts of texts of errors without a row, and the tests that raise them."""
