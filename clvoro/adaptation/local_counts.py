@@ -47,7 +47,7 @@ class PieceCounts:
     """
 
     def __init__(self, mesh: MeshState, w: CellWeights) -> None:
-        self._piece = connected_components(mesh.t)
+        self._piece = connected_components(mesh.t.starts.get(), mesh.t.neighbors.get())
         self._cells = np.bincount(self._piece)
         self._required = np.bincount(self._piece, w.weight.get())
 

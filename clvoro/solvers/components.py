@@ -28,7 +28,7 @@ def balance_components(domain: Domain, t: Tessellation, source: cla.Array, weigh
     """
     if domain.n_pieces == 1:
         return
-    component = connected_components(t)
+    component = connected_components(t.starts.get(), t.neighbors.get())
     values, weight = source[: t.n].get(), weights[: t.n].get().astype(float)
     sums, total = (np.bincount(component, v) for v in (values, weight))
     means = np.divide(sums, total, out=sums, where=total > 0)
@@ -45,22 +45,26 @@ def fit_components(domain: Domain, t: Tessellation, prescribed: cla.Array) -> bo
     """
     if domain.n_pieces == 1:
         return False
-    component = connected_components(t)
+    component = connected_components(t.starts.get(), t.neighbors.get())
     volumes, wanted = t.volumes.get().astype(float), prescribed.get().astype(float)
     factors = np.bincount(component, volumes) / np.bincount(component, wanted)
     prescribed.set((wanted * factors[component]).astype(prescribed.dtype))
     return True
 
 
-def connected_components(t: Tessellation) -> np.ndarray:
+def connected_components(starts: np.ndarray, neighbors: np.ndarray) -> np.ndarray:
     """Return the number of each cell's connected component in the neighbor graph, (n,) int.
 
     The positions of the generators are not sufficient for that: a generator in a corner that several pieces share lies
     in all of them, and a piece without a generator consists of parts of cells and connects them.
+
+    Parameters
+    ----------
+    starts : (n + 1,) int32
+    neighbors : (m,) int32
+        Of cell i from ``starts[i]`` on; negative for walls. The array may be longer.
     """
-    starts = t.starts.get()
-    other = t.neighbors[: starts[-1]].get()
-    walls = other < 0
-    other[walls] = np.repeat(np.arange(t.n, dtype=other.dtype), np.diff(starts))[walls]
-    graph = scipy.sparse.csr_array((np.ones(len(other), np.int8), other, starts), shape=(t.n, t.n))
+    n, other = len(starts) - 1, neighbors[: starts[-1]]
+    other = np.where(other < 0, np.repeat(np.arange(n, dtype=other.dtype), np.diff(starts)), other)
+    graph = scipy.sparse.csr_array((np.ones(len(other), np.int8), other, starts), shape=(n, n))
     return scipy.sparse.csgraph.connected_components(graph, directed=False)[1]

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -18,6 +18,7 @@ from ..errors import InputError
 from ..opencl.engine import Engine
 from ..opencl.kernels import Kernels
 from ..opencl.launch import COSTS_ON_CPU, CostFactors, Launch, cost_factors, one_group_limit
+from .components import connected_components
 from .conjugate_gradient import CURVATURE, ConjugateGradient
 from .linear_system import BreakdownError, Limits, Operator, Precondition, Solution
 from .multigrid import Multigrid
@@ -304,7 +305,8 @@ class Poisson:
         InputError
             If an argument has the wrong size or value.
         SolverError
-            If a number is not finite, or the iteration breaks down with Jacobi's preconditioner.
+            If a number is not finite, or the iteration breaks down with Jacobi's preconditioner. If the graph is not
+            connected, the mean of the right side in each part of it is subtracted before a second try.
         """
         n, part = len(laplacian), laplacian.part
         _check("rhs", rhs, (n,))
@@ -332,7 +334,31 @@ class Poisson:
     def _solve_jacobi(self, system: _Equation, max_iterations: int, from_zero: bool) -> Solution:
         with self.engine.workspace.frame():
             inverse = self.inverse_diagonal(system.laplacian)
-            return self._run(system, inverse, max_iterations, 64, from_zero)
+            try:
+                return self._run(system, inverse, max_iterations, 64, from_zero)
+            except BreakdownError:
+                if (balanced := self._balanced(system)) is None:
+                    raise
+                return self._run(balanced, inverse, max_iterations, 64, from_zero=True)
+
+    def _balanced(self, system: _Equation) -> _Equation | None:
+        """Return a system without the mean of its right side in each connected part of the graph.
+
+        It has no solution otherwise. None if there is one part, or cells are in other processes.
+        """
+        laplacian = system.laplacian
+        if laplacian.part is not None:
+            return None
+        starts = laplacian.starts.get()
+        weights, columns = (array.get()[: starts[-1]] for array in (laplacian.weights, laplacian.neighbors))
+        component = connected_components(starts, np.where(weights > 0, columns, -1))
+        values, sizes = system.rhs.get(), np.bincount(component)
+        if len(sizes) == 1:
+            return None
+        means = np.bincount(component, values) / sizes
+        # A cell without neighbors has no one that could absorb its round-off.
+        values = np.where(sizes[component] == 1, 0, values - means[component]).astype(values.dtype)
+        return replace(system, rhs=self.engine.upload(values, values.dtype))
 
     def _solve_multigrid(
         self, system: _Equation, max_iterations: int | None, ordering: object, from_zero: bool
