@@ -91,4 +91,4 @@ def test_components_follow_from_the_graph_not_from_positions(ctx):
     corner = shared_corners(domain)
     for others, count in (([(0.2, 0.3), (0.7, 0.6)], 2), ([(0.2, 0.3), (0.1, 0.1)], 1)):
         _, t = tessellate(ctx, domain, np.concatenate([corner, others]))
-        assert connected_components(t).max() + 1 == count
+        assert connected_components(t.starts.get(), t.neighbors.get()).max() + 1 == count
