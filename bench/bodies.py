@@ -9,9 +9,10 @@ airfoil: a NACA 0012 section without incidence at Re 1000, in a square of 20 cho
 "Graded" has sizes that grow from the body, by a share of the distance; the size at the body follows from the number of
 cells. "Adapted" begins with a uniform mesh of --first cells, in which the body is as small as a cell or smaller;
 `clvoro.foam.adapt_case` makes --cycles meshes for the forces on the body (`FieldSizes(forces="body")`). No place is
-named, no size is given. Errors are those of the coefficient of drag in percent of the limit of fine meshes in the same
-box: bench/RESULTS.md says how it was found. With --samples several meshes are made for each row, with counts that
-differ by one percent and with other seeds: shown are the median and the range.
+named, no size is given. Errors are those of the coefficient of drag in percent of a reference: for the airfoil that of
+fine meshes in the same box, known to 0.5 %, for the sphere one without a box (Johnson and Patel 1999, from memory).
+With --samples several meshes are made for each row, with counts that differ by one percent and with other seeds: shown
+are the median and the range.
 """
 
 from __future__ import annotations
