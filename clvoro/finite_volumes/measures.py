@@ -202,20 +202,34 @@ class SolverMeasures:
     @cached_property
     def concave(self) -> np.ndarray:
         """Whether OpenFOAM counts the cell as concave: a face's center is beyond the plane of another one, (n,)."""
-        _, face, sign = self.face_cells
-        starts, order = self.cells.cell_faces()
-        areas = self.geometry.areas[face[order]] * sign[order][:, None]
-        centers = self.geometry.centers[face[order]]
-        first, _ = concave_pairs(
-            np.ascontiguousarray(centers.T),
-            np.ascontiguousarray(areas.T),
-            starts,
-            -PLANAR_COSINE,
-            np.ones(len(order), bool),
-        )
         concave = np.zeros(self.mesh.n_cells, bool)
-        concave[np.searchsorted(starts, first, "right") - 1] = True
+        concave[self.concave_pairs()[1]] = True
         return concave
+
+    def concave_pairs(
+        self, limit: float = -PLANAR_COSINE, judged: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the pairs of faces with a cosine above `limit`, see `defects.concave_pairs`, of the cells `judged`.
+
+        Returns
+        -------
+        faces : (2, p) int
+        cells : (p,) int
+        sine : (p,) float
+            How far the center of the second face is beyond the plane of the first, over the distance of the centers.
+        """
+        cell, face, sign = self.face_cells
+        places = self.cells.cell_faces()[1]
+        places = places if judged is None else places[judged[cell[places]]]
+        cell, face = cell[places], face[places]
+        starts = np.concatenate([[0], np.cumsum(np.bincount(cell, minlength=self.mesh.n_cells))])
+        centers = np.ascontiguousarray(self.geometry.centers[face].T)
+        areas = np.ascontiguousarray((self.geometry.areas[face] * sign[places, None]).T)
+        i, j = concave_pairs(centers, areas, starts, limit, np.ones(len(face), bool))
+        line = centers[:, j] - centers[:, i]
+        size = np.linalg.norm(areas[:, i], axis=0) * np.linalg.norm(line, axis=0)
+        sine = (areas[:, i] * line).sum(axis=0) / np.maximum(size, 1e-300)
+        return face[np.stack([i, j])], cell[i], np.maximum(sine, 0)
 
     @cached_property
     def concavity(self) -> np.ndarray:

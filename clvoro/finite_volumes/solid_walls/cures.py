@@ -14,20 +14,15 @@ from collections.abc import Iterator
 import numpy as np
 
 from ...mesh.faces import Faces
-from .editing import Edits, edges_of, judge
+from .cutting import CellCut, planes_through
+from .editing import Edge, Edits, area_of, between, edges_of, judge
 from .mend import rejected_at_walls
 from .wall_surface import WallSurface
 
 _SNAPS = (0.1, 0.03)
 """Vertices this near to the plane of a cut, over h, are in it; the less where a cut is impossible with the first."""
-_FOLD = 0.02
-"""Height of the fold in a face that a cut divides, over its length. In one plane its parts would count as concave."""
 _REFLEX = 2.0
 """Least angle beyond 180 degrees of an edge at which a cell is cut."""
-_ROOM = 3.0
-"""Least angle, in degrees, between a cut and the continuation of a face at the edge."""
-_PLANES = 10
-"""Most planes through an edge that are tried."""
 _EDGES = 3
 """Most concave edges of a cell that are tried."""
 _LEAST_GAIN = 0.05
@@ -52,8 +47,6 @@ _AHEAD = 1
 _BRANCHES, _MOST_BAD = 2, 3
 """How many such cures are followed, and for how many cells."""
 
-Edge = tuple[int, int]
-"""Both ends, the lower one first."""
 Gain = tuple[int, float, float]
 """Change of the number of rejected cells, and of their excess; the worst measure after it. See `judge`."""
 
@@ -71,12 +64,11 @@ class Cures:
 
     def __init__(self, surface: WallSurface, faces: Faces, sizes: np.ndarray) -> None:
         self.surface, self.edits, self.sizes = surface, Edits(faces), sizes
-        self.home: dict[int, int] = {}
         self.changes, self.searches, self.changed, self.tried = 0, 0, dict[int, int](), dict[int, int]()
 
-    def h(self, cell: int) -> float:
+    def h(self, edits: Edits, cell: int) -> float:
         """Return the size of a cell."""
-        return float(self.sizes[self.home.get(cell, cell)])
+        return float(self.sizes[edits.origins.get(cell, cell)])
 
     def cure(self, cell: int) -> bool:
         """Change the mesh around a cell if it is rejected and this helps; return whether it does."""
@@ -144,7 +136,7 @@ class Cures:
         sides: dict[tuple[int, int], tuple[int, np.ndarray]] = {}
         for k in edits.faces_of(cell):
             loop = edits.seen(k, cell)
-            normal = _area(edits.positions(loop))
+            normal = area_of(edits.positions(loop))
             normal /= max(float(np.linalg.norm(normal)), 1e-300)
             for edge in edges_of(loop):
                 sides[edge] = k, normal
@@ -162,184 +154,18 @@ class Cures:
 
     def cuts(self, edits: Edits, cell: int) -> Iterator[Edits]:
         """Cut a cell at a concave edge."""
+        h = self.h(edits, cell)
         for turn, edge, _, right, one in self._concave_edges(edits, cell)[:_EDGES]:
-            for normal in self._planes(edits, cell, turn, edge, one):
+            for normal in planes_through(edits, cell, edge, turn, one, h):
                 for near in _SNAPS:
                     trial = edits.trial()
-                    if self._divided(trial, cell, edge, right, normal, near * self.h(cell)):
+                    if CellCut(trial, cell, edge, right, normal, near * h).make(self._on_surface):
                         yield trial
                         break
 
-    def _planes(self, edits: Edits, cell: int, turn: float, edge: Edge, one: np.ndarray) -> list[np.ndarray]:
-        """Return the normals of planes through a concave edge that leave less than 180 degrees on both sides.
-
-        They point to the side of the face with the outward normal `one`, which is left of the edge.
-        """
-        x = edits.point(edge[0])
-        along = edits.point(edge[1]) - x
-        along /= np.linalg.norm(along)
-        across, inward = np.cross(one, along), -one
-        across -= (across @ along) * along
-        across /= np.linalg.norm(across)
-        inward = np.cross(along, across) if np.cross(along, across) @ inward > 0 else -np.cross(along, across)
-        least, most = math.radians(turn + _ROOM), math.radians(180 - _ROOM)
-        middle = math.radians(180 + turn) / 2
-        if least > most:
-            angles = [middle]
-        else:
-            arms = edits.positions(sorted(edits.vertices(cell) - set(edge))) - x
-            far = np.hypot(arms @ across, arms @ inward) > 0.2 * self.h(cell)
-            at = np.arctan2(arms @ inward, arms @ across)[far] % (2 * math.pi)
-            at = at[(at >= least) & (at <= most)]
-            at = at[np.argsort(np.abs(at - middle))][: _PLANES - 5]
-            angles = [middle, *at.tolist(), *(least + s * (most - least) for s in (0, 0.25, 0.75, 1))]
-        return [math.sin(t) * across - math.cos(t) * inward for t in angles]
-
-    def _divided(
-        self, edits: Edits, cell: int, edge: tuple[int, int], below: int, normal: np.ndarray, snap: float
-    ) -> bool:
-        """Cut a cell by the plane through a concave edge into two parts; return False if there are not two.
-
-        The face `below` lies right of the edge, on the lower side of the plane. Vertices near the plane are in it, and
-        count as above. So the section leads along edges of the cell whose other end is below.
-        """
-        x0 = edits.point(edge[0])
-        vertices = sorted(edits.vertices(cell))
-        heights = dict(zip(vertices, ((edits.positions(vertices) - x0) @ normal).tolist(), strict=True))
-        flat = {v for v, d in heights.items() if abs(d) < snap} | set(edge)
-        up = {v for v, d in heights.items() if d > 0} | flat
-        beside = {v for pair in edges_of(edits.face(below)[2]) if set(pair) & set(edge) for v in pair} - set(edge)
-        beside = {v for v in beside if heights[v] < 2 * snap}
-        up, flat = up - beside, flat - beside
-        loops = {k: edits.seen(k, cell) for k in edits.faces_of(cell)}
-        chords: dict[int, list[tuple[Edge, Edge]]] = {}
-        at: dict[Edge, list[int]] = {}
-        for k, loop in loops.items():
-            chords[k] = self._chords(edits, loop, up, flat, normal, heights)
-            for pair in chords[k]:
-                for key in pair:
-                    at.setdefault(key, []).append(k)
-        first = [pair for pair in chords[below] if any(set(key) & set(edge) for key in pair)]
-        if not first or any(len(faces) != 2 for faces in at.values()):
-            return False
-        # Follow the section through the faces.
-        k, (here, there) = below, first[0]
-        path = [(k, here, there)]
-        first = here
-        while there != first:
-            here = there
-            one, other = at[here]
-            k = other if k == one else one
-            there = next(q if p == here else p for p, q in chords[k] if here in (p, q))
-            path.append((k, here, there))
-            if len(path) > len(at):
-                return False
-        number: dict[Edge, int] = {}
-        for _, key, _ in path:
-            p, q = key if key[0] in up else key[::-1]
-            if p in flat:
-                number[key] = p
-            else:
-                high, deep = max(heights[p], 1e-9 * snap), max(-heights[q], 1e-9 * snap)
-                share = high / (high + deep)
-                place = (1 - share) * edits.point(p) + share * edits.point(q)
-                number[key] = edits.divide_edge(cell, p, q, self._on_surface(edits, cell, p, q, place))
-        section: list[int] = []
-        parts_of: dict[int, list[tuple[int, ...]]] = {}
-        for k, begin, end in path:
-            i, j = number[begin], number[end]
-            section.append(i)
-            after: list[int] = []
-            if i == j:
-                continue
-            loop = edits.seen(k, cell)
-            if k in parts_of or i not in loop or j not in loop:
-                return False
-            p, q = loop.index(i), loop.index(j)
-            forth, back = _between(loop, p, q), _between(loop, q, p)  # from i to j, and on
-            higher, swap = (forth, False) if not any(v in heights and v not in up for v in forth) else (back, True)
-            if flat.issuperset(higher):  # the section follows its sides
-                section += (higher[::-1] if swap else higher)[1:-1]
-                continue
-            if k == below:  # which may also go on beyond the edge
-                if i in edge and (forth[1] in edge or back[-2] in edge):
-                    i = next(v for v in edge if v != i)
-                    section.append(i)
-                elif j in edge and (back[1] in edge or forth[-2] in edge):
-                    last = j
-                    j = next(v for v in edge if v != j)
-                    after = [j, last]
-                p, q = loop.index(i), loop.index(j)
-                forth, back = _between(loop, p, q), _between(loop, q, p)
-            middle = []
-            if edits.across(k, cell) >= 0:
-                middle = [edits.add_point(self._fold(edits, loop, i, j, normal))]
-            parts_of[k] = [(*forth, *middle[::-1]), (*back, *middle)]
-            section += middle + after
-        section = [v for k, v in enumerate(section) if v != section[k - 1]]
-        if len(section) < 3 or len(set(section)) != len(section):
-            return False
-        # Which parts of faces are on which side of the section?
-        border = set(edges_of(tuple(section)))
-        border |= {(q, p) for p, q in border}
-        if edge not in border:
-            return False
-        pieces: list[tuple[int, int, tuple[int, ...]]] = []
-        for k in edits.faces_of(cell):
-            pieces += [(k, edits.across(k, cell), loop) for loop in parts_of.get(k, [edits.seen(k, cell)])]
-        side = _components([loop for *_, loop in pieces], border)
-        if max(side) != 1:
-            return False
-        upper = next(s for s, (*_, loop) in zip(side, pieces, strict=True) if edge in edges_of(loop))
-        open_edges = {e for s, (_, _, loop) in zip(side, pieces, strict=True) if s == upper for e in edges_of(loop)}
-        floor = tuple(section)
-        if any((q, p) not in open_edges for p, q in edges_of(floor)):
-            floor = floor[::-1]
-            if any((q, p) not in open_edges for p, q in edges_of(floor)):
-                return False
-        new = edits.add_cell()
-        self.home[new] = self.home.get(cell, cell)
-        over = cell >= edits.mesh.n_cells or (edits.mesh.generators[cell] - x0) @ normal > 0
-        mine = upper if over else 1 - upper
-        for k in parts_of:
-            edits.drop(k)
-        for s, (k, n, loop) in zip(side, pieces, strict=True):
-            if k in parts_of:
-                edits.add(cell if s == mine else new, n, loop)
-            elif s != mine:
-                edits.drop(k)
-                edits.put(k, new, n, loop)
-        edits.add(cell if mine == upper else new, new if mine == upper else cell, floor)
-        return True
-
-    @staticmethod
-    def _chords(
-        edits: Edits, loop: tuple[int, ...], up: set[int], flat: set[int], normal: np.ndarray, heights: dict[int, float]
-    ) -> list[tuple[Edge, Edge]]:
-        """Return the lines in which a plane cuts a face, from edge to edge of the face."""
-        ends = [(p, q) for p, q in edges_of(loop) if (p in up) != (q in up)]
-        keys = [(min(e), max(e)) for e in ends]
-        if len(ends) > 2:
-            x = edits.positions(loop)
-            along = np.cross(_area(x), normal)
-            at = []
-            for p, q in ends:
-                share = abs(heights[p]) / max(abs(heights[p]) + abs(heights[q]), 1e-300)
-                at.append(float(((1 - share) * edits.point(p) + share * edits.point(q)) @ along))
-            keys = [keys[k] for k in np.argsort(at, kind="stable").tolist()]
-        return list(zip(keys[::2], keys[1::2], strict=True))
-
-    def _fold(self, edits: Edits, loop: tuple[int, ...], i: int, j: int, normal: np.ndarray) -> np.ndarray:
-        """Return the middle of the line across a face that is divided, moved into the cell that is cut."""
-        x, y = edits.point(i), edits.point(j)
-        out = _area(edits.positions(loop))
-        out -= (out @ normal) * normal
-        out /= max(float(np.linalg.norm(out)), 1e-300)
-        return (x + y) / 2 - _FOLD * float(np.linalg.norm(y - x)) * out
-
     def _on_surface(self, edits: Edits, cell: int, a: int, b: int, x: np.ndarray) -> np.ndarray:
         """Return a point on the edge from a to b, moved onto the patch or the crease that has the edge."""
-        found = self._placed(edits.patches_at(cell, a, b), x, self.h(cell))
+        found = self._placed(edits.patches_at(cell, a, b), x, self.h(edits, cell))
         return x if found is None else found
 
     def _placed(self, walls: set[int], x: np.ndarray, h: float) -> np.ndarray | None:
@@ -385,7 +211,7 @@ class Cures:
 
     def collapses(self, edits: Edits, cell: int) -> Iterator[Edits]:
         """Collapse a short edge or a small face of a cell."""
-        h = self.h(cell)
+        h = self.h(edits, cell)
         groups: set[frozenset[int]] = set()
         for k in edits.faces_of(cell):
             loop = edits.face(k)[2]
@@ -413,7 +239,7 @@ class Cures:
         """Merge a cell with a neighbor."""
         for other in edits.alive(edits.neighbors(cell)):
             for gone, left in ((cell, other), (other, cell)):
-                if gone >= edits.mesh.n_cells or self._volume(edits, gone) < _SMALL * self.h(gone) ** 3:
+                if gone >= edits.mesh.n_cells or self._volume(edits, gone) < _SMALL * self.h(edits, gone) ** 3:
                     trial = edits.trial()
                     if _merge(trial, gone, left):
                         yield trial
@@ -425,7 +251,7 @@ class Cures:
             loop = _joined(edits.seen(left, cell), edits.seen(right, cell))
             if max(walls) >= 0 or loop is None:
                 continue
-            areas = [float(np.linalg.norm(_area(edits.positions(edits.face(k)[2])))) for k in (left, right)]
+            areas = [float(np.linalg.norm(area_of(edits.positions(edits.face(k)[2])))) for k in (left, right)]
             for gone in ((), edge):
                 trial = edits.trial()
                 trial.drop(left)
@@ -445,8 +271,8 @@ class Cures:
                 if 1 < q - p < len(loop) - 1:
                     trial = edits.trial()
                     trial.drop(k)
-                    trial.add(owner, wall, _between(loop, p, q))
-                    trial.add(owner, wall, _between(loop, q, p))
+                    trial.add(owner, wall, between(loop, loop[p], loop[q]))
+                    trial.add(owner, wall, between(loop, loop[q], loop[p]))
                     yield trial
 
     def losses(self, edits: Edits, cell: int) -> Iterator[Edits]:
@@ -462,8 +288,8 @@ class Cures:
             yield trial
         walls = [k for k in edits.faces_of(cell) if edits.across(k, cell) < 0]
         inner = sorted(set(edits.faces_of(cell)) - set(walls))
-        if walls and self._volume(edits, cell) < (_TIP if len(inner) < _FEW else _SLIVER) * self.h(cell) ** 3:
-            areas = {k: float(np.linalg.norm(_area(edits.positions(edits.face(k)[2])))) for k in walls}
+        if walls and self._volume(edits, cell) < (_TIP if len(inner) < _FEW else _SLIVER) * self.h(edits, cell) ** 3:
+            areas = {k: float(np.linalg.norm(area_of(edits.positions(edits.face(k)[2])))) for k in walls}
             wall = edits.across(max(walls, key=lambda k: areas[k]), cell)
             trial = edits.trial()
             for k in walls:
@@ -480,7 +306,7 @@ class Cures:
         total = 0.0
         for k in edits.faces_of(cell):
             x = edits.positions(edits.seen(k, cell))
-            total += float(x[0] @ _area(x))  # of a face that is nearly flat
+            total += float(x[0] @ area_of(x))  # of a face that is nearly flat
         return total / 3
 
 
@@ -546,47 +372,6 @@ def _helps(gain: Gain) -> bool:
     return gain[0] < 0 or (gain[0] == 0 and gain[1] < -_LEAST_GAIN)
 
 
-def _area(x: np.ndarray) -> np.ndarray:
-    """Return the area vector of a polygon x (k, 3)."""
-    rows = x.tolist()
-    u, v, w = rows[0]
-    a = b = c = 0.0
-    for (p, q, r), (s, t, z) in itertools.pairwise([(p - u, q - v, r - w) for p, q, r in rows[1:]]):
-        a += q * z - r * t
-        b += r * s - p * z
-        c += p * t - q * s
-    return np.array((0.5 * a, 0.5 * b, 0.5 * c))
-
-
-def _between(loop: tuple[int, ...], p: int, q: int) -> tuple[int, ...]:
-    """Return the corners of a loop from place p to place q."""
-    return loop[p : q + 1] if p <= q else loop[p:] + loop[: q + 1]
-
-
-def _components(loops: list[tuple[int, ...]], border: set[tuple[int, int]]) -> list[int]:
-    """Return for each face the number of the part that it belongs to; parts meet at the `border` only."""
-    at: dict[tuple[int, int], list[int]] = {}
-    for k, loop in enumerate(loops):
-        for edge in edges_of(loop):
-            if edge not in border:
-                at.setdefault((min(edge), max(edge)), []).append(k)
-    part = [-1] * len(loops)
-    number = 0
-    for first in range(len(loops)):
-        if part[first] >= 0:
-            continue
-        todo = [first]
-        part[first] = number
-        while todo:
-            for p, q in edges_of(loops[todo.pop()]):
-                for k in at.get((min(p, q), max(p, q)), ()):
-                    if part[k] < 0:
-                        part[k] = number
-                        todo.append(k)
-        number += 1
-    return part
-
-
 def cured(
     surface: WallSurface, faces: Faces, home: np.ndarray, own: np.ndarray, sizes: np.ndarray, rejected: np.ndarray
 ) -> tuple[Faces, np.ndarray, np.ndarray, np.ndarray]:
@@ -610,6 +395,6 @@ def cured(
     left = rejected_at_walls(made)
     if len(left) > len(rejected):
         return faces, home, own, rejected
-    origin = np.array([cures.home.get(c, c) for c in cells.tolist()])
+    origin = np.array([cures.edits.origins.get(c, c) for c in cells.tolist()])
     is_own = (cells < len(own)) & np.append(own, np.zeros(cures.edits.next_cell, bool))[cells]
     return made, home[origin], is_own, left

@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterable, Iterator
 
 import numpy as np
 
 from ...mesh.connectivity import take_rows
 from ...mesh.faces import Faces
-from ..defects import concave_pairs
 from ..gate import LEAST_DETERMINANT, LEAST_MEASURE
-from ..measures import PLANAR_COSINE
 
 _MOST_FACES = 200
 """Cells with more faces stand for many, and are not judged."""
 Face = tuple[int, int, tuple[int, ...]]
 """Owner, neighbor and corners; see `Faces`."""
+Edge = tuple[int, int]
+"""Both ends."""
 
 
 class Edits:
@@ -31,6 +32,8 @@ class Edits:
     ----------
     touched : set of int
         Cells whose faces, or whose points, have changed, also those that are gone.
+    origins : dict of int
+        The cell of `mesh` of which each new cell is a part.
     """
 
     def __init__(self, mesh: Faces, parent: Edits | None = None) -> None:
@@ -39,6 +42,7 @@ class Edits:
         self._cells: dict[int, frozenset[int]] = {}
         self._points: dict[int, np.ndarray] = {}
         self.touched: set[int] = set()
+        self.origins: dict[int, int] = {} if parent is None else dict(parent.origins)
         if parent is None:
             self.next_face, self.next_cell, self.next_point = len(mesh), mesh.n_cells, len(mesh.points)
             starts, places = mesh.cell_faces()
@@ -63,6 +67,7 @@ class Edits:
         self._cells |= trial._cells
         self._points |= trial._points
         self.touched |= trial.touched
+        self.origins = trial.origins
         self.next_face, self.next_cell, self.next_point = trial.next_face, trial.next_cell, trial.next_point
 
     # Reading.
@@ -183,8 +188,9 @@ class Edits:
         self.put(self.next_face - 1, cell, other, loop)
         return self.next_face - 1
 
-    def add_cell(self) -> int:
-        """Return the number of a new cell, without faces."""
+    def add_cell(self, part_of: int) -> int:
+        """Return the number of a new cell, without faces, that becomes a part of another one."""
+        self.origins[self.next_cell] = self.origins.get(part_of, part_of)
         self._cells[self.next_cell] = frozenset()
         self.touched.add(self.next_cell)
         self.next_cell += 1
@@ -278,6 +284,24 @@ def edges_of(loop: tuple[int, ...]) -> Iterator[tuple[int, int]]:
     return zip(loop, loop[1:] + loop[:1], strict=True)
 
 
+def area_of(x: np.ndarray) -> np.ndarray:
+    """Return the area vector of a polygon x (k, 3)."""
+    rows = x.tolist()
+    u, v, w = rows[0]
+    a = b = c = 0.0
+    for (p, q, r), (s, t, z) in itertools.pairwise([(p - u, q - v, r - w) for p, q, r in rows[1:]]):
+        a += q * z - r * t
+        b += r * s - p * z
+        c += p * t - q * s
+    return np.array((0.5 * a, 0.5 * b, 0.5 * c))
+
+
+def between(loop: tuple[int, ...], begin: int, end: int) -> tuple[int, ...]:
+    """Return the corners of a loop from one to another."""
+    p, q = loop.index(begin), loop.index(end)
+    return loop[p : q + 1] if p <= q else loop[p:] + loop[: q + 1]
+
+
 def judge(trials: list[tuple[Edits, list[int]]]) -> list[tuple[np.ndarray, np.ndarray]]:
     """Judge some cells of each trial by the criteria of OpenFOAM, all together, as cells of one mesh.
 
@@ -357,23 +381,8 @@ def _measured(mesh: Faces, mine: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     for cells, rows in ((mesh.owner, slice(None)), (mesh.neighbor[inner], inner)):
         excess += np.bincount(cells, wrong[rows], n)
         np.maximum.at(most, cells, worst[rows])
-    cell, angle = find_concave(mesh)
-    excess += np.bincount(cell, 1 + angle, n)
+    _, cells, sine = m.concave_pairs(judged=mine)
+    excess += np.bincount(cells, 1 + sine, n)
     flat = LEAST_DETERMINANT / np.maximum(m.determinant, 1e-9)
     excess += (g.volumes < LEAST_MEASURE) + (flat > 1) + (m.aspect_ratio > 1000)
     return excess, np.maximum(most, flat)
-
-
-def find_concave(mesh: Faces) -> tuple[np.ndarray, np.ndarray]:
-    """Return for each pair of faces that OpenFOAM takes for concave the cell and the sine of the angle, (p,) each."""
-    cells, face = mesh.sides()
-    starts, places = mesh.cell_faces()
-    face, sign = face[places], np.where(places >= len(mesh), -1.0, 1.0)
-    centers, areas = mesh.measures.geometry.centers[face].T, mesh.measures.geometry.areas[face].T * sign
-    i, j = concave_pairs(
-        np.ascontiguousarray(centers), np.ascontiguousarray(areas), starts, -PLANAR_COSINE, np.ones(len(face), bool)
-    )
-    line = centers[:, j] - centers[:, i]
-    high = (areas[:, i] * line).sum(axis=0)
-    size = np.linalg.norm(areas[:, i], axis=0) * np.linalg.norm(line, axis=0)
-    return cells[places][i], np.maximum(high / np.maximum(size, 1e-300), 0)

@@ -5,28 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from ...mesh.faces import Faces
-from ..defects import DefectLimits, concave_pairs
+from ..defects import DefectLimits
 from ..gate import rejected_cells
 
 _NARROW = 0.08
 """Faces between two cells smaller than this share of h^2 are collapsed if their cells are concave there."""
-
-
-def find_concave(faces: Faces) -> tuple[np.ndarray, np.ndarray]:
-    """Return pairs of faces of a cell at a wall that are concave: the faces (2, p) and the cell (p,)."""
-    at_wall = np.zeros(faces.n_cells, bool)
-    at_wall[faces.owner[faces.n_inner :]] = True
-    cells, face = faces.sides()
-    starts, places = faces.cell_faces()
-    kept = at_wall[cells[places]]
-    places = places[kept]
-    counts = np.diff(starts)[at_wall]
-    face, sign = face[places], np.where(places >= len(faces), -1.0, 1.0)
-    centers = np.ascontiguousarray(faces.center[face].T)
-    areas = np.ascontiguousarray((faces.normal[face] * (faces.area[face] * sign)[:, None]).T)
-    rows = np.concatenate([[0], np.cumsum(counts)])
-    pairs = concave_pairs(centers, areas, rows, DefectLimits().concavity, np.ones(len(face), bool))
-    return face[pairs], np.repeat(np.flatnonzero(at_wall), counts)[pairs[0]]
 
 
 def narrow_faces(faces: Faces, sizes: np.ndarray) -> np.ndarray:
@@ -35,9 +18,10 @@ def narrow_faces(faces: Faces, sizes: np.ndarray) -> np.ndarray:
     At curved walls the chord between two cells may bulge out of both wall polygons. If their common face is small, its
     center does so, too.
     """
-    pairs, _ = find_concave(faces)
+    at_wall = np.zeros(faces.n_cells, bool)
+    at_wall[faces.owner[faces.n_inner :]] = True
     chosen = np.zeros(len(faces), bool)
-    chosen[pairs.ravel()] = True
+    chosen[faces.measures.concave_pairs(DefectLimits().concavity, at_wall)[0]] = True
     chosen[faces.n_inner :] = False
     h = np.minimum(sizes[faces.owner], sizes[np.maximum(faces.neighbor, 0)])
     return chosen & (faces.area < _NARROW * h**2)
