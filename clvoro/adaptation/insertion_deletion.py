@@ -50,7 +50,7 @@ class Generators:
 
 @dataclass(frozen=True)
 class Outcome:
-    """Generators after insertions and deletions, those of one part, and the numbers of both in all parts."""
+    """The generators of a part after insertions and deletions, and how many all parts have inserted and deleted."""
 
     generators: Generators
     inserted: int
@@ -268,13 +268,9 @@ class InsertionDeletion:
         """Return the array for keys of all rows."""
         return self._room("keys", size=t.rows, dtype=np.uint64)
 
-    def _total(self, t: Tessellation, values: np.ndarray) -> np.ndarray:
-        """Return the sum of `values` over all parts."""
-        return values if t.part is None else t.part.total(values)
-
     def _count(self, t: Tessellation) -> int:
         """Return the number of generators of all parts."""
-        return int(self._total(t, np.array([t.n]))[0])
+        return int(t.total(np.array(t.n)))
 
     def _nucleate(self, t: Tessellation, kinds: cla.Array, strain: cla.Array, marks: _Marks, nuclei: int) -> None:
         """Mark at most `nuclei` insertions and as many mergers where the perfect lattice is strained most."""
@@ -349,7 +345,7 @@ class InsertionDeletion:
         chosen = self._choose(t, keys, PAIR_RINGS)
         tally = self._room.zeros("tally", size=SHIFTS, dtype=np.int32)
         engine.run_each(k.count_pair_changes, n, chosen, pull, kinds, partners, strain_limit, tally)
-        changes = self._total(t, tally.get())
+        changes = t.total(tally.get())
         # The shift whose change is closest to the need; the smallest of equal ones.
         shifts = (np.arange(SHIFTS) - SHIFTS // 2) * SHIFT_STEP
         order = np.argsort(np.abs(shifts), kind="stable")
@@ -393,19 +389,12 @@ class InsertionDeletion:
         """Remove sites at fixed generators and, with `neighbors`, next to them."""
         if self._fixed:
             with self.engine.workspace.frame():
-                self.engine.run_each(
-                    self._kernels.drop_fixed_sites,
-                    t.n,
-                    t.starts,
-                    t.neighbors,
-                    t.with_ghosts(self.engine, self._labels),
-                    np.int32(self._fixed),
-                    np.int32(neighbors),
-                    keys,
-                )
+                labels = t.fixed_args(self.engine, self._labels, self._fixed)
+                drop = self._kernels.drop_fixed_sites
+                self.engine.run_each(drop, t.n, t.starts, t.neighbors, *labels, np.int32(neighbors), keys)
 
     def spread(self, t: Tessellation, source: cla.Array, rings: int) -> cla.Array:
-        """Return the largest key within `rings` rings of each generator. `source` gets the keys of ghosts."""
+        """Return the largest key within `rings` rings of each generator. The rows of ghosts in `source` are filled."""
         engine, n = self.engine, t.n
         into, other = (self._room("spread", turn, size=t.rows, dtype=np.uint64) for turn in range(2))
         groups, at_once = (1, rings) if n <= self._one_group_limit and t.part is None else (engine.groups, 1)
@@ -435,7 +424,7 @@ class InsertionDeletion:
         return chosen
 
     def _limit(self, t: Tessellation, chosen: cla.Array, most: int) -> None:
-        """Keep the `most` strongest sites of all parts. Keys are distinct."""
+        """Keep the `most` sites of the largest keys, of those that all parts have `chosen`. No two keys are equal."""
         engine, k = self.engine, self._kernels
         low, span = 0, 2**64
         while True:
@@ -443,7 +432,7 @@ class InsertionDeletion:
             width = span // bins
             histogram = self._room.zeros("histogram", size=HISTOGRAM, dtype=np.int32)
             engine.run_each(k.count_sites, t.n, chosen, np.uint64(low), np.uint64(width), histogram)
-            from_top = np.cumsum(self._total(t, histogram.get())[:bins][::-1])
+            from_top = np.cumsum(t.total(histogram.get())[:bins][::-1])
             whole = int(np.searchsorted(from_top, most, side="right"))
             least = low + (bins - whole) * width
             most -= int(from_top[whole - 1]) if whole else 0
@@ -463,7 +452,7 @@ class InsertionDeletion:
             self._scan.exclusive(counts, counts, n, total=(totals, place))
         kept, born = found = totals.get()
         first = next_label + (0 if t.part is None else int(t.part.before(found)[1]))
-        (left, inserted), deleted = self._total(t, found).tolist(), self._count(t)
+        (left, inserted), deleted = t.total(found).tolist(), self._count(t)
         deleted -= left
         m = int(kept + born)
         if left + inserted == 0 or (deleted == 0 and inserted == 0):

@@ -41,7 +41,7 @@ class Refinement:
             Generators with labels below `fixed`, and edges that end in them, get no new generators.
         """
         engine, k, n = self.engine, self._kernels, t.n
-        fixed_args = t.starts if labels is None else t.with_ghosts(engine, labels), np.int32(fixed), *t.name_args
+        fixed_args = *t.fixed_args(engine, labels, fixed), *t.name_args
         starts = self._child_starts(t, *fixed_args)
         finer = engine.empty((n + int(starts[n].get()), engine.dim))
         engine.run_each(
@@ -76,7 +76,7 @@ class Refinement:
 
     def count(self, t: Tessellation) -> int:
         """Return the number of generators after `refine`."""
-        return t.n + int(self._child_starts(t, t.starts, np.int32(0), *t.name_args)[t.n].get())
+        return t.n + int(self._child_starts(t, *t.fixed_args(self.engine, None, 0), *t.name_args)[t.n].get())
 
     def _child_starts(self, t: Tessellation, *fixed_args: object) -> cla.Array:
         """Return the prefix sums (n + 1,) int32 of the numbers of new generators."""

@@ -80,10 +80,12 @@ class CellBuilder(ABC):
         exact: bool = True,
         rows: int | None = None,
     ) -> Tessellation:
-        """Build the cells of `part`, whose generators lie in `binned`.
+        """Build the cells of `part`.
 
         Parameters
         ----------
+        binned : BinnedPoints
+            The generators and ghosts of `part`, sorted into bins.
         previous : Tessellation or NeighborRows, optional
             A diagram of the same generators at earlier positions: with `from_previous` clipping starts from its
             neighbors.
@@ -91,8 +93,8 @@ class CellBuilder(ABC):
             Reject generators so close together that round-off makes more than `EXACT_SHARE` of a cell uncertain;
             otherwise more than `ROUGH_SHARE`.
         rows : int, optional
-            Number of cells to build, those of the first generators, by default all: of ghosts, too. Their faces with
-            other cells are not matched.
+            Build the cells of only so many of the first rows of `part`; by default those of ghosts, too. Faces between
+            cells that are built and others are not matched.
 
         Raises
         ------
@@ -117,7 +119,7 @@ class CellBuilder(ABC):
     @property
     @abstractmethod
     def defines(self) -> dict[str, object]:
-        """For building kernels that work on rows of faces."""
+        """Macros for building kernels that work on rows of faces."""
 
     def knows_corners(self, t: Tessellation) -> bool:
         """Return whether the corners of the cells of `t` are known, so that they can be measured in another order."""

@@ -113,7 +113,7 @@ class Cells(CellBuilder):
                 whole = True
 
     def _clip(self, rows: FaceRows, part: Part, binned: BinnedPoints, exact: bool) -> tuple[int, int]:
-        """Build and match the `rows` of the first generators of `part`; return as `_match` does."""
+        """Build and match the faces of the first ``rows.n`` cells of `part`, and return what `_match` returns."""
         engine, corners, n, total = self.engine, part.box.device_corners(self.engine.real), rows.n, part.count
         hulls = self._hulls if n >= LANES_FROM[2] else None
         some = hulls is not None

@@ -200,6 +200,17 @@ class Tessellation:
         """Return `values` (n, ...) and behind them those of ghosts, in the workspace; `values` if there are none."""
         return values if self.part is None else self.part.with_ghosts(engine, values)
 
+    def total(self, values: np.ndarray) -> np.ndarray:
+        """Return the sum of `values` over all parts of the domain; `values` if this is the whole."""
+        return values if self.part is None else self.part.total(values)
+
+    def fixed_args(self, engine: Engine, labels: cla.Array | None, fixed: int) -> tuple[object, ...]:
+        """Return `labels` (n,) int32 with those of ghosts, and `fixed`, as arguments of kernels.
+
+        Generators with labels below `fixed` are. Without `labels` none is, and another array stands for them.
+        """
+        return self.starts if labels is None else self.with_ghosts(engine, labels), np.int32(fixed)
+
     @property
     def name_args(self) -> tuple[object, ...]:
         """The NAME_ARGS of kernels (adaptation/site_key.h): the labels of a part."""

@@ -103,7 +103,7 @@ class Polyhedra(CellBuilder):
 
     @property
     def defines(self) -> dict[str, object]:
-        """None."""
+        """No macros."""
         return {}
 
     def knows_corners(self, t: Tessellation) -> bool:

@@ -177,7 +177,7 @@ class Tessellator:
         with self._in_units(part.points, part.count):
             t = self._cells(part, self._sorted(part), exact, part.count if whole else part.n_own)
         own = t.first(part.n_own) if t.n > part.n_own else t
-        return replace(own, part=part, whole=t)
+        return replace(own, part=part, whole=t if t.n == part.count else None)
 
     def _build(
         self,

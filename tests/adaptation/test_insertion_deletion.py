@@ -323,7 +323,7 @@ def test_limit_keeps_the_strongest(engine):
         keys[rng.random(n) < 0.3] = 0
         most = int(rng.integers(0, n + 3))
         chosen = engine.upload(keys, np.uint64)
-        control._limit(SimpleNamespace(n=n, part=None), chosen, most)
+        control._limit(SimpleNamespace(n=n, total=np.asarray), chosen, most)
         kept = np.sort(chosen.get())[::-1]
         kept = kept[kept > 0]
         expected = np.sort(keys[keys > 0])[::-1][:most]
