@@ -1,8 +1,8 @@
-"""The last step of a mesh of a solid: what makes single cells acceptable that OpenFOAM rejects.
+"""The last step of a mesh of a solid: change it around single cells that OpenFOAM rejects, so that it accepts them.
 
-A cell with a concave edge, as at a concave crease, is cut by a plane through it. Cells that are too flat or skew are
-merged with a neighbor, edges collapsed, vertices moved. Each cure is tried, and kept only if fewer cells are rejected
-than before.
+A cell that is concave at an edge, as at a concave crease, is cut in two. Other cures collapse short edges and small
+faces, merge cells, and change or divide faces; the last ones leave out a part of the solid. All are tried on a rejected
+cell. The best one is kept if it leaves fewer cells rejected than before, or as many, but nearer to what is accepted.
 """
 
 from __future__ import annotations
@@ -20,32 +20,32 @@ from .mend import rejected_at_walls
 from .wall_surface import WallSurface
 
 _SNAPS = (0.1, 0.03)
-"""Vertices this near to the plane of a cut, over h, are in it; the less where a cut is impossible with the first."""
+"""Vertices nearer to the plane of a cut than this, over h, count as in it. The second is tried if the first fails."""
 _REFLEX = 2.0
-"""Least angle beyond 180 degrees of an edge at which a cell is cut."""
+"""A cell is concave at an edge if its angle there is more than this beyond 180 degrees."""
 _EDGES = 3
 """Most concave edges of a cell that are tried."""
 _LEAST_GAIN = 0.05
-"""Least fall of `Verdict.excess` for which a mesh is changed."""
+"""Where no fewer cells are rejected, a change is kept if their excess, see `judge`, falls by more than this."""
 _FOLDED = 100.0
-"""Least angle beyond 180 degrees of faces that are folded back."""
+"""Faces of a cell are folded onto each other if the angle between them is more than this beyond 180 degrees."""
 _SHORT = 0.25
-"""Shorter edges, and faces with a smaller radius, over h, may be collapsed."""
+"""Edges shorter than this, over h, may be collapsed, and faces with all corners nearer to their mean."""
 _SMALL = 0.4
-"""Cells with a smaller volume over h^3 may be merged with a neighbor, and all that are parts of others."""
+"""Cells with a smaller volume, over h^3, may be merged with a neighbor; new parts of cells always may."""
 _REACH = 0.3
-"""Distance over h of a crease or corner to which a vertex may be moved."""
+"""A vertex may be moved onto a crease or corner that is nearer than this, over h."""
 _SLIVER, _TIP, _FEW = 0.05, 0.4, 4
-"""Cells with a smaller volume over h^3 may be left out; those with fewer neighbors than this may be larger."""
+"""Cells at walls with a volume below `_SLIVER`, over h^3, may be left out; below `_TIP` with fewer than `_FEW` faces to
+others. So may up to `_FEW` cells without faces to others."""
 _TOO_MANY = 0.2
 """Where more than this share of the cells are rejected, the solid is as thin as a cell, and no cure is tried."""
 _BUDGET, _MOST = 12, 400
-"""Most changes of one rejected cell at a time, and most searches for cures of a mesh."""
-
+"""Most changes of a rejected cell before others have their turn, and most searches for cures of a mesh."""
 _AHEAD = 1
-"""How many further cures may follow one that does not help by itself."""
+"""Where no cure of a cell helps, cures of the cells that OpenFOAM rejects after it may follow: how many in turn."""
 _BRANCHES, _MOST_BAD = 2, 3
-"""How many such cures are followed, and for how many cells."""
+"""After how many of the cures of a cell others are tried, and for how many rejected cells."""
 
 Gain = tuple[int, float, float]
 """Change of the number of rejected cells, and of their excess; the worst measure after it. See `judge`."""
@@ -60,6 +60,13 @@ class Cures:
     faces : Faces
     sizes : (n,) float
         h of the cells.
+
+    Attributes
+    ----------
+    edits : Edits
+        The mesh with all changes that are kept.
+    searches : int
+        How often cures have been tried on a cell.
     """
 
     def __init__(self, surface: WallSurface, faces: Faces, sizes: np.ndarray) -> None:
@@ -71,7 +78,7 @@ class Cures:
         return float(self.sizes[edits.origins.get(cell, cell)])
 
     def cure(self, cell: int) -> bool:
-        """Change the mesh around a cell if it is rejected and this helps; return whether it does."""
+        """Make the best change to the mesh around a cell if it is rejected; return whether one helps."""
         edits = self.edits
         if self.tried.get(cell) == self.stamp(cell) or not edits.faces_of(cell) or judge([(edits, [cell])])[0][0] == 0:
             return False
@@ -92,9 +99,10 @@ class Cures:
         return max(self.changed.get(c, 0) for c in {cell, *self.edits.neighbors(cell)})
 
     def _best(self, edits: Edits, cell: int, ahead: int, last: bool) -> tuple[Gain, Edits] | None:
-        """Return the best cure of a cell, or None if there is none.
+        """Return the best cure of a cell: what it gains, and the changes; None if no cure helps.
 
-        `ahead` cures may follow one that does not help. The `last` ones leave out a crease.
+        Up to `ahead` cures of other cells may follow one that does not help by itself. With `last` cures are also
+        tried that leave out a crease or a part of the solid.
         """
         cures = [self.cuts, self.transfers, self.collapses, self.mergers, self.halves]
         cures += [self.unions, self.losses] if last else []
@@ -129,9 +137,10 @@ class Cures:
     # Cuts.
 
     def _concave_edges(self, edits: Edits, cell: int) -> list[tuple[float, Edge, int, int, np.ndarray]]:
-        """Return the edges where a cell is concave: angle, ends, both faces, and the normal of the first, left, one.
+        """Return the edges where a cell is concave, the one with the largest angle first.
 
-        The largest angle comes first.
+        Each is a tuple: the angle beyond 180 degrees, the ends, the faces left and right of the edge, as seen from
+        outside, and the outward normal of the left one.
         """
         sides: dict[tuple[int, int], tuple[int, np.ndarray]] = {}
         for k in edits.faces_of(cell):
@@ -164,7 +173,7 @@ class Cures:
                         break
 
     def _on_surface(self, edits: Edits, cell: int, a: int, b: int, x: np.ndarray) -> np.ndarray:
-        """Return a point on the edge from a to b, moved onto the patch or the crease that has the edge."""
+        """Return x on the edge from a to b, moved onto the patch or crease that has the edge."""
         found = self._placed(edits.patches_at(cell, a, b), x, self.h(edits, cell))
         return x if found is None else found
 
@@ -189,7 +198,7 @@ class Cures:
     # Other cures.
 
     def transfers(self, edits: Edits, cell: int) -> Iterator[Edits]:
-        """Give a face of a cell that is folded back onto another one to the cell behind that."""
+        """Where two faces of a cell are folded onto each other, give one of them to the cell behind the other."""
         for turn, _, left, right, _ in self._concave_edges(edits, cell)[: 2 * _EDGES]:
             if turn < _FOLDED:
                 continue
@@ -245,7 +254,7 @@ class Cures:
                         yield trial
 
     def unions(self, edits: Edits, cell: int) -> Iterator[Edits]:
-        """Make one of two wall polygons that meet at a concave edge, also without its ends."""
+        """Join two wall polygons that meet at a concave edge; the ends of the edge stay, or are left out."""
         for _, edge, left, right, _ in self._concave_edges(edits, cell)[:_EDGES]:
             walls = [edits.across(k, cell) for k in (left, right)]
             loop = _joined(edits.seen(left, cell), edits.seen(right, cell))
@@ -276,7 +285,7 @@ class Cures:
                     yield trial
 
     def losses(self, edits: Edits, cell: int) -> Iterator[Edits]:
-        """Leave out a small cell at a wall: its faces to others become walls in its place. Or a few without others."""
+        """Leave out a small cell at a wall: its faces to others become walls. Or a few cells that touch no others."""
         part, beside = {cell}, edits.neighbors(cell)
         while not beside <= part and len(part) < _FEW:
             part |= beside
@@ -302,16 +311,16 @@ class Cures:
 
     @staticmethod
     def _volume(edits: Edits, cell: int) -> float:
-        """Return the volume of a cell."""
+        """Return the volume of a cell with faces that are nearly flat."""
         total = 0.0
         for k in edits.faces_of(cell):
             x = edits.positions(edits.seen(k, cell))
-            total += float(x[0] @ area_of(x))  # of a face that is nearly flat
+            total += float(x[0] @ area_of(x))
         return total / 3
 
 
 def _collapse(edits: Edits, cell: int, vertices: list[int], target: np.ndarray) -> None:
-    """Make one vertex of several."""
+    """Make one vertex, at `target`, of several; faces with fewer than three corners left vanish."""
     first, *others = vertices
     edits.move(cell, first, target)
     for v in others:
@@ -325,7 +334,10 @@ def _collapse(edits: Edits, cell: int, vertices: list[int], target: np.ndarray) 
 
 
 def _merge(edits: Edits, cell: int, other: int) -> bool:
-    """Give all faces of a cell to a neighbor; faces to the same cell or wall that meet become one."""
+    """Give all faces of a cell to a neighbor, and join its faces that meet and have the same cell or wall behind them.
+
+    Return whether the neighbor has faces.
+    """
     for k in sorted(edits.faces_of(cell)):
         n, loop = edits.across(k, cell), edits.seen(k, cell)
         edits.drop(k)
@@ -368,16 +380,16 @@ def _joined(one: tuple[int, ...], other: tuple[int, ...]) -> tuple[int, ...] | N
 
 
 def _helps(gain: Gain) -> bool:
-    """Return whether a change helps."""
+    """Return whether fewer cells are rejected, or as many with clearly less excess."""
     return gain[0] < 0 or (gain[0] == 0 and gain[1] < -_LEAST_GAIN)
 
 
 def cured(
     surface: WallSurface, faces: Faces, home: np.ndarray, own: np.ndarray, sizes: np.ndarray, rejected: np.ndarray
 ) -> tuple[Faces, np.ndarray, np.ndarray, np.ndarray]:
-    """Return the mesh with its `rejected` cells (k,) cured where that works, and `home`, `own` and what is rejected.
+    """Return the mesh with its `rejected` cells (k,) cured where that works, `home`, `own`, and what is rejected.
 
-    Trials judge the cells that they touch. A mesh with more rejected cells in all than before is not taken.
+    All as in `_Made`. The mesh comes back as it is if in the end more of its cells would be rejected than before.
     """
     if len(rejected) > _TOO_MANY * faces.n_cells:
         return faces, home, own, rejected

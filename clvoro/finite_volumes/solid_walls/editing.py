@@ -1,4 +1,8 @@
-"""Polyhedra whose faces and vertices are changed one at a time, on trial, and judged as OpenFOAM does."""
+"""Polyhedra whose faces and vertices are changed one at a time, on trial, and judged as OpenFOAM does.
+
+`merging` collapses edges and faces all over a large mesh, many at once, in arrays. Here are few cells, but any change
+of their faces, and many trials of each, which store what they change and read all else from the mesh.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +16,7 @@ from ...mesh.faces import Faces
 from ..gate import LEAST_DETERMINANT, LEAST_MEASURE
 
 _MOST_FACES = 200
-"""Cells with more faces stand for many, and are not judged."""
+"""A cell with more faces is the one that `NearWalls` has in place of all cells far from walls; it is not judged."""
 Face = tuple[int, int, tuple[int, ...]]
 """Owner, neighbor and corners; see `Faces`."""
 Edge = tuple[int, int]
@@ -55,11 +59,11 @@ class Edits:
             self.next_face, self.next_cell, self.next_point = parent.next_face, parent.next_cell, parent.next_point
 
     def trial(self) -> Edits:
-        """Return changes on top of these."""
+        """Return changes on top of these, none at first. They can be dropped, or become part of these; see `take`."""
         return Edits(self.mesh, self)
 
     def take(self, trial: Edits) -> None:
-        """Make the changes of a trial on top of these, or of a trial on top of such a trial."""
+        """Make the changes of a trial part of these, also of a trial of a trial."""
         if trial.parent is not self:
             assert trial.parent is not None
             self.take(trial.parent)
@@ -100,7 +104,7 @@ class Edits:
         return at._cells[cell]
 
     def is_vast(self, cell: int) -> bool:
-        """Return whether a cell stands for many."""
+        """Return whether a cell stands for all that are far from walls."""
         return len(self.faces_of(cell)) > _MOST_FACES
 
     def point(self, v: int) -> np.ndarray:
@@ -147,7 +151,7 @@ class Edits:
         return {v for k in self.faces_of(cell) for v in self.face(k)[2]}
 
     def faces_at(self, cell: int, *vertices: int) -> dict[int, set[int]]:
-        """Return the cells that have all of `vertices`, reached from `cell` through such faces, and the faces."""
+        """Return the faces that have all of `vertices`, for each cell with such faces; they lead there from `cell`."""
         found: dict[int, set[int]] = {}
         todo = [cell]
         while todo:
@@ -159,7 +163,7 @@ class Edits:
         return found
 
     def patches_at(self, cell: int, *vertices: int) -> set[int]:
-        """Return the walls (negative numbers) that have all of the vertices."""
+        """Return the walls, as negative numbers, of the wall polygons that have all of the vertices."""
         at = self.faces_at(cell, *vertices)
         return {n for faces in at.values() for k in faces if (n := self.face(k)[1]) < 0}
 
@@ -219,7 +223,7 @@ class Edits:
         return new
 
     def is_sound(self, cell: int) -> bool:
-        """Return whether the faces of a cell close it: each edge belongs to two of them, each corner once to one."""
+        """Return whether the faces of a cell close it: each edge has two of them, and no face a corner twice."""
         faces = self.faces_of(cell)
         if not faces:
             return True
@@ -237,11 +241,11 @@ class Edits:
     # Results.
 
     def alive(self, cells: Iterable[int]) -> list[int]:
-        """Return those of `cells` that have faces, and do not stand for many."""
+        """Return those of `cells` that have faces, but not the one for all that are far from walls."""
         return sorted(c for c in cells if self.faces_of(c) and not self.is_vast(c))
 
     def result(self) -> tuple[Faces, np.ndarray]:
-        """Return the mesh with all changes, and the number that each of its cells has here."""
+        """Return the mesh with all changes, and the number of each of its cells in these edits."""
         assert self.parent is None
         m = self.mesh
         kept = np.ones(len(m), bool)
@@ -308,8 +312,8 @@ def judge(trials: list[tuple[Edits, list[int]]]) -> list[tuple[np.ndarray, np.nd
     Returns
     -------
     list of (excess, worst)
-        By how much limits are exceeded, over all faces and pairs of faces of each cell, (k,) float, above 0 if OpenFOAM
-        rejects it; and the worst of its measures over the limit, (k,) float.
+        The excess of each cell, (k,) float: by how much limits are exceeded, summed over all its faces and pairs of
+        faces; above 0 if OpenFOAM rejects it. And the worst of its measures over their limits, (k,) float.
     """
     owner, neighbor, loops, points = [], [], [], []
     judged: list[int] = []
@@ -365,7 +369,7 @@ def judge(trials: list[tuple[Edits, list[int]]]) -> list[tuple[np.ndarray, np.nd
 
 
 def _measured(mesh: Faces, mine: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return what `judge` does for each cell that is `mine` (n,), (n,) each."""
+    """Return excess and worst as `judge` does, (n,) each, right for the cells that are `mine` (n,) bool."""
     m, g, n = mesh.measures, mesh.measures.geometry, mesh.n_cells
     c = m.coupled
     inner = mesh.neighbor >= 0

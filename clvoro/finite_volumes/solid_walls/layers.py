@@ -24,23 +24,24 @@ if TYPE_CHECKING:
     from ...geometry.solid.solid import Solid
 
 _SUITED = 0.25
-"""Largest distance of a moved vertex from where all its walls want it, over the thickness; else layers end there."""
+"""A vertex should move away from each of its patches by the thickness there. Layers end if this fails by more than this
+share of it."""
 _LONGEST = 2.2
 """Longest way of a vertex over the thickness: three walls at right angles need 1.73."""
 _SAME = 0.15
-"""Normals of walls that span less than this share of the largest direction count as one."""
+"""Patches at a vertex count as parallel if the tangent of half the angle between their normals is less than this."""
 _OF_GAP = 0.15
 """Share of the distance to the opposite wall that layers fill."""
 _SLOPE = 0.6
-"""Largest change of the thickness along a wall."""
+"""Largest change of the thickness along a wall, over the distance."""
 _DEPTH, _DEEPER = 2.0, 8.0
-"""How far from walls vertices follow: over h, and over the way of the wall."""
+"""How far from a wall that moves inner vertices move with it: this times h, and this times the way of the wall."""
 _SWEEPS = 100
 """Steps that make the ways of vertices along walls smooth."""
 _RESIDUAL, _MOST = 1e-3, 60
-"""Relative residual and most iterations of the smooth ways of inner vertices."""
+"""Relative residual and most iterations of the linear systems for the ways of inner vertices."""
 _STIFFER = 20
-"""Steps that make the ways of the vertices of a cell linear."""
+"""Steps that make the ways of the vertices of a `stiff` cell nearly linear in their places."""
 _ROUNDS, _THINNER, _LAST_ROUNDS = 7, 0.6, 8
 """How often layers are made thinner where cells are rejected, by which factor, and how often they end there."""
 _STEEP = 65.0
@@ -48,7 +49,7 @@ _STEEP = 65.0
 _FLAT = 500
 """Prisms with a larger ratio of width and height are not made thinner."""
 _LEAST = 0.08
-"""Layers thinner than this share of the full thickness end."""
+"""Where layers would be thinner than this share of the full thickness, there are none."""
 _FULL = 0.9
 """Layers count as full from this share of the thickness on."""
 
@@ -169,9 +170,9 @@ class _LayeredWalls:
         self.layered = self.count[self.patch] > 0
 
     def _meet(self) -> None:
-        """Set for each vertex the normals of its patches, and the way on which it moves by the full thickness.
+        """Set for each vertex the patches it lies on, and the way on which it moves by the full thickness.
 
-        `way` (u, 3) is 0 where layers end; `along` (u, 3, 3) projects a way onto all patches of the vertex.
+        `way` (u, 3) is 0 where layers end; `along` (u, 3, 3) leaves of a vector what is parallel to all these patches.
         """
         p, u = self.solid.n_patches, len(self.vertices)
         keys, pair = np.unique(self.corners * p + self.patch[self.face], return_inverse=True)
@@ -192,12 +193,11 @@ class _LayeredWalls:
         off = np.abs(np.einsum("uji,ui->uj", normals, way) - wanted).max(axis=1)
         full = np.abs(wanted).max(axis=1)
         self.column = full > 0  # vertices of polygons with layers
-        # A border that is not at a wall of its own, and edges that more than two polygons share.
         suited = self.column & (off < _SUITED * full) & (np.linalg.norm(way, axis=1) < _LONGEST * full)
         self.way = np.where(suited[:, None], way, 0.0)
         with_layers = np.bincount(self.pair_vertex, self.count[self.pair_patch] > 0, u)
         self.border = suited & (with_layers < self.n_patches)
-        rows = np.flatnonzero(self.border)
+        rows = np.flatnonzero(self.border)  # these must also stay on their patches without layers
         wanted = self.faces.points[self.vertices[rows]] + self.way[rows]
         off = np.linalg.norm(self._onto_patches(rows, wanted, bare=True) - wanted, axis=1)
         self.way[rows[off > _SUITED * full[rows]]] = 0
@@ -210,7 +210,7 @@ class _LayeredWalls:
         self._pair_sides()
 
     def _pair_sides(self) -> None:
-        """Find for each side of a wall polygon that of the polygon beyond it; layers end where there is not one."""
+        """Find the side of another wall polygon at each side of one; layers end where there is none, or several."""
         begin, end = self.corners, self.corners[following(self.starts)]
         low, high = np.minimum(begin, end), np.maximum(begin, end)
         _, edge, number = np.unique(low * len(self.vertices) + high, return_inverse=True, return_counts=True)
@@ -224,7 +224,7 @@ class _LayeredWalls:
         self.way[np.concatenate([begin[alone], end[alone]])] = 0
 
     def _onto_patches(self, rows: np.ndarray, places: np.ndarray, bare: bool = False) -> np.ndarray:
-        """Return for each vertex of `rows` (k,) the point near `places` (k, 3) on its patches, `bare` ones only."""
+        """Return `places` (k, 3) of the vertices `rows` (k,), on their patches; `bare`: on those without layers."""
         place = np.full(len(self.vertices), -1)
         place[rows] = np.arange(len(rows))
         mine = place[self.pair_vertex] >= 0
@@ -252,7 +252,7 @@ class _LayeredWalls:
 
     @cached_property
     def _room(self) -> np.ndarray:
-        """How far the wall is that faces each vertex on its way, (u,); inf if that is far, or it does not move."""
+        """How far each vertex is, on its way, from another wall, (u,); inf if that is far, or it does not move."""
         length = np.linalg.norm(self.way, axis=1)
         room, rows = np.full(len(length), np.inf), np.flatnonzero(length)
         x = self.faces.points[self.vertices[rows]]
@@ -284,7 +284,7 @@ class _LayeredWalls:
                 np.minimum.at(most, here, high[there] + _SLOPE * apart)
             lower = np.where(most < high, most / np.maximum(length, 1e-300), share)
             lower[lower < _LEAST] = 0.0
-            # A prism with one side that is not flat would be a sliver.
+            # Prisms with thickness at one corner only would be slivers.
             active = np.bincount(self.face, lower[self.corners] > 0, len(self.rows))
             lone = self.layered & (active == 1)
             lower[self.corners[lone[self.face]]] = 0.0
@@ -293,7 +293,7 @@ class _LayeredWalls:
             share = np.minimum(share, lower)
 
     def thinner(self, share: np.ndarray, bad: np.ndarray, attempt: int) -> np.ndarray:
-        """Return smaller shares (u,) at the vertices `bad`; around those that have no layers any more, too.
+        """Return the shares (u,), smaller at the vertices `bad`, and around those of them that have no layers any more.
 
         From the attempt `_ROUNDS` on layers end there, each time farther around them.
         """
@@ -310,9 +310,10 @@ class _LayeredWalls:
 
     @cached_property
     def _followers(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Vertices of the mesh that follow others (b,), those others (b,), and how much at first (b,).
+        """Vertices that follow others: which, the nearest of the others, and its weight as a first guess, (b,) each.
 
-        First those of walls with layers, which slide along their patches, then all others near these.
+        First those of walls with layers, which slide along their patches, as vertices of creases move; then all others
+        near walls that move.
         """
         x, moving = self.faces.points, self.way.any(axis=1)
         found = []
@@ -338,9 +339,9 @@ class _LayeredWalls:
 
     @cached_property
     def _outward(self) -> np.ndarray:
-        """Vertices of creases from which walls turn away, (u,) bool: these move away from their polygons.
+        """Vertices of creases that move away from their polygons, (u,) bool, as at concave creases.
 
-        Inner vertices follow them along the wall, and the vertices on the wall above stay.
+        Other vertices of the wall follow them along it, but the points above these, on the surface, stay.
         """
         arm = self.faces.center[self.rows][self.face] - self.faces.points[self.vertices[self.corners]]
         inward = (arm * self.way[self.corners]).sum(axis=1) * self.layered[self.face]

@@ -9,14 +9,14 @@ from ..defects import DefectLimits
 from ..gate import rejected_cells
 
 _NARROW = 0.08
-"""Faces between two cells smaller than this share of h^2 are collapsed if their cells are concave there."""
+"""Faces between two cells are collapsed if they are smaller than this share of h^2 and a cell is concave there."""
 
 
 def narrow_faces(faces: Faces, sizes: np.ndarray) -> np.ndarray:
-    """Return the small faces between two cells whose centers lie outside of the plane of another face, (f,) bool.
+    """Return the small faces between two cells at a wall with which a cell is concave, (f,) bool.
 
-    At curved walls the chord between two cells may bulge out of both wall polygons. If their common face is small, its
-    center does so, too.
+    Where a wall is curved, the common edge of two wall polygons may bulge out of the planes of both. So does the center
+    of the face between their cells if that is small.
     """
     at_wall = np.zeros(faces.n_cells, bool)
     at_wall[faces.owner[faces.n_inner :]] = True
@@ -38,7 +38,7 @@ def rejected_at_walls(faces: Faces) -> np.ndarray:
         ring[a[rings[-1][b]]] = ring[b[rings[-1][a]]] = True
         rings.append(ring)
     cells, part = np.flatnonzero(rings[2]), faces.part(rings[2])[0]
-    # Faces of other cells are those of the diagram.
+    # Other faces are those of the diagram, whose tetrahedra are right.
     at_wall = rings[0][cells]
     judged = np.flatnonzero(at_wall[part.owner] | (at_wall[np.maximum(part.neighbor, 0)] & (part.neighbor >= 0)))
     return cells[rejected_cells(part, judged) & rings[1][cells]]
