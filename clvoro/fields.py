@@ -5,8 +5,6 @@ from __future__ import annotations
 import contextlib
 import csv
 import io
-import warnings
-import zipfile
 from collections.abc import Callable, Iterable, Sequence
 from os import PathLike
 from pathlib import Path
@@ -14,15 +12,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .arguments import check_number, check_path
-from .earth.netcdf_read import Variables, lonlat_names, open_netcdf
+from .arguments import check_number, check_path, warn
+from .earth.netcdf_read import NETCDF_SUFFIXES, Variables, lonlat_names, open_netcdf
 from .errors import InputError, InputTypeError, MismatchWarning
 from .files import open_plain
 from .foam.case import FoamCase
 from .foam.mesh import FoamMesh
 from .geometry.domain import Domain
 from .io import load
-from .io.arrays import FileError, explained, is_kind, read_array
+from .io.arrays import FileError, array_names, explained, is_kind, read_array
 from .io.npz import FORMAT
 from .io.vtu_read import cell_data_of_vtu
 from .mesh.diagram import Diagram
@@ -31,10 +29,10 @@ from .shared import voronoi
 from .sizing.arguments import coverage_warnings
 
 _SAME = 1e-9
-"""Places are the same, or on a wall, if they are nearer than this share of the domain's longest side."""
+"""Places are the same if they are nearer than this share of the domain's longest side."""
 _NEAR_WALL = 1e-3
-"""Places beyond a wall by less than this share of the domain are on it: walls of other meshes are facets of curves."""
-_NETCDF, _TABLES = (".nc", ".nc4", ".cdf", ".netcdf"), (".csv", ".txt", ".dat", ".tsv")
+"""Places outside by less than this share of that side count as on the wall: other meshes have facets for curves."""
+_TABLES = (".csv", ".txt", ".dat", ".tsv")
 _AXES = (("x", "y", "z"), ("lon", "lat"), ("longitude", "latitude"))
 _MPAS_PLACES = ("xCell", "yCell", "zCell", "lonCell", "latCell")
 
@@ -132,21 +130,19 @@ def _reader(path: Path) -> Callable[[Path, tuple[str, ...] | None, float | None]
     kind = path.suffix.lower()
     if path.is_dir() or kind == ".foam":
         return _of_openfoam
-    if kind in _NETCDF:
+    if kind in NETCDF_SUFFIXES:
         return _of_netcdf
     if kind in _TABLES:
         return _of_table
     if kind == ".npz":
         return _of_clvoro if is_kind(path, FORMAT) else _of_arrays
     if kind == ".vtu":
-        with open_plain(path):  # an error if it is missing
-            own = cell_data_of_vtu(path, ())
-        return _of_meshio if own is None else _of_clvoro
+        return _of_meshio if cell_data_of_vtu(path, ()) is None else _of_clvoro
     return _of_meshio
 
 
 def _chosen(wanted: Iterable[str] | None, present: Iterable[str]) -> list[str]:
-    """Return the names that are wanted, all by default.
+    """Return the names that are wanted, each once; all by default.
 
     Raises
     ------
@@ -157,22 +153,21 @@ def _chosen(wanted: Iterable[str] | None, present: Iterable[str]) -> list[str]:
     absent = [name for name in wanted or () if name not in there]
     if absent or not there:
         raise FileError(f"it has no field {', '.join(absent) or 'at all'}; it has {', '.join(there) or 'none'}")
-    return list(wanted or there)
+    return list(dict.fromkeys(wanted or there))
 
 
-def _one_time(time: float | None) -> None:
+def _refuse_time(time: float | None) -> None:
+    """Raise FileError if a time is given for a file without times."""
     if time is not None:
         raise FileError(f"it has no times, and time is {time:g}; leave it out")
 
 
 def _of_clvoro(path: Path, wanted: tuple[str, ...] | None, time: float | None) -> _Found:
-    _one_time(time)
+    _refuse_time(time)
     made = load(path)
     mesh = made.diagram if isinstance(made, Result) else made
     if path.suffix.lower() == ".npz":
-        with zipfile.ZipFile(path) as archive:
-            names = [n.removesuffix(".npy") for n in archive.namelist()]
-        there = {n.removeprefix("cell_data."): n for n in names if n.startswith("cell_data.")}
+        there = {n.removeprefix("cell_data."): n for n in array_names(path) if n.startswith("cell_data.")}
         values = {n: read_array(path, there[n]).astype(float) for n in _chosen(wanted, there)}
     else:
         values = cell_data_of_vtu(path, wanted) or {}
@@ -214,7 +209,7 @@ def _domain_of(foam: FoamMesh) -> Domain | None:
 
 
 def _of_table(path: Path, wanted: tuple[str, ...] | None, time: float | None) -> _Found:
-    _one_time(time)
+    _refuse_time(time)
     with open_plain(path) as file:
         try:
             lines = file.read().decode("utf-8-sig").splitlines()
@@ -250,9 +245,9 @@ def _numbers(name: str, column: Sequence[str] | np.ndarray) -> np.ndarray:
 
 
 def _of_columns(columns: dict[str, tuple[str, ...]], wanted: tuple[str, ...] | None) -> _Found:
-    """Return the values beside the columns x, y (, z) or lon, lat.
+    """Return the fields of a table, at the places in its columns x, y (, z), or lon, lat, or Points.
 
-    ParaView writes Points:0 and U:0, U:1, U:2, or Points_0 and U_0, U_1, U_2.
+    ParaView writes a column for each component: Points:0 and U:0, U:1, U:2, or Points_0 and U_0, U_1, U_2.
     """
     mark, split = "_" if "Points_0" in columns else ":", dict[str, list[str]]()
     for name in columns:
@@ -265,20 +260,19 @@ def _of_columns(columns: dict[str, tuple[str, ...]], wanted: tuple[str, ...] | N
 
     if len(split.get("Points", ())) > 1:
         places = take("Points")
-        return _Found({n: take(n) for n in dict.fromkeys(_chosen(wanted, split))}, places)
+        return _Found({n: take(n) for n in _chosen(wanted, split)}, places)
     lower = {name.lower(): name for name in split}
     for axes in _AXES:
         along = [lower[axis] for axis in axes if axis in lower]
         if len(along) >= 2 and all(len(split[n]) == 1 for n in along):
             places = np.stack([take(n) for n in along], axis=1)
-            return _Found({n: take(n) for n in dict.fromkeys(_chosen(wanted, split))}, places, axes[0] != "x")
+            return _Found({n: take(n) for n in _chosen(wanted, split)}, places, axes[0] != "x")
     raise FileError(f"it has the columns {', '.join(columns):.300}, expected x, y (, z) or lon, lat among them")
 
 
 def _of_arrays(path: Path, wanted: tuple[str, ...] | None, time: float | None) -> _Found:
-    _one_time(time)
-    with open_plain(path) as file, zipfile.ZipFile(file) as archive:
-        names = [name.removesuffix(".npy") for name in archive.namelist()]
+    _refuse_time(time)
+    names = array_names(path)
     if "points" not in names:
         raise FileError(f"it has the arrays {', '.join(names):.300}, expected points (n, d) among them")
     places = read_array(path, "points").astype(float)
@@ -304,14 +298,11 @@ def _of_netcdf(path: Path, wanted: tuple[str, ...] | None, time: float | None) -
                 "it has no fields by UGRID or MPAS, nor with the attribute coordinates; for sizes on a grid of "
                 'longitudes and latitudes take Raster, or kind = "raster" in a case file'
             )
-        values, used = {}, []
-        for name in _chosen(wanted, present):
-            names, along, on_globe = there[name]
-            values[name] = _at_time(file, name, along, time)
-            used.append((names, along, on_globe))
-        if len(set(used)) > 1:
+        values = {name: _at_time(file, name, there[name][1], time) for name in _chosen(wanted, present)}
+        used = {there[name] for name in values}
+        if len(used) > 1:
             raise FileError(f"its fields {', '.join(values)} are at different places; read them one after the other")
-        names, along, on_globe = used[0]
+        names, _, on_globe = used.pop()
         places = np.stack([file.data(name) for name in names], axis=1)
         if names[0] == "lonCell":
             places = np.degrees(places)
@@ -322,7 +313,11 @@ def _of_netcdf(path: Path, wanted: tuple[str, ...] | None, time: float | None) -
 
 
 def _coordinates(file: Variables, name: str) -> tuple[tuple[str, ...], str, bool] | None:
-    """Return the coordinates of a variable, the dimension along them, and whether they are on a globe; else None."""
+    """Return where the values of a variable are; None if the file does not say it.
+
+    These are the names of the coordinates, which are variables of one dimension, that dimension, and whether they are
+    longitude and latitude.
+    """
     dims = file.dimensions(name)
     sphere = str(file.attribute("on_a_sphere")).strip().upper() == "YES"
     cells = ("lonCell", "latCell") if sphere else ("xCell", "yCell")
@@ -357,14 +352,14 @@ def _at_time(file: Variables, name: str, along: str, time: float | None) -> np.n
             values, dims = values.take(int(at), axis=k), dims[:k] + dims[k + 1 :]
             break
     else:
-        _one_time(time)
+        _refuse_time(time)
     at = dims.index(along)
     values = np.moveaxis(values, at, 0).reshape(values.shape[at], -1)
     return values[:, 0] if values.shape[1] == 1 else values
 
 
 def _of_meshio(path: Path, wanted: tuple[str, ...] | None, time: float | None) -> _Found:
-    _one_time(time)
+    _refuse_time(time)
     with open_plain(path):
         pass
     try:
@@ -436,7 +431,7 @@ def _on_mesh(name: str, found: _Found, domain: Domain | None) -> tuple[Diagram, 
             f"than {domain.dim}; do units and the order of the coordinates agree?"
         )
     for text in coverage_warnings(name, domain, x[near].min(axis=0), x[near].max(axis=0), "give values everywhere"):
-        warnings.warn(text, MismatchWarning, stacklevel=3)
+        warn(text, MismatchWarning)
     x = domain.wrap(on[near])
     key = np.round((x - domain.lower) / (_SAME * size)).astype(np.int64)
     _, first, cell = np.unique(key, axis=0, return_index=True, return_inverse=True)

@@ -20,6 +20,7 @@ from ..mesh.connectivity import following
 from ..mesh.diagram import Diagram
 from ..mesh.results import Result, result_of_file
 
+NETCDF_SUFFIXES = (".nc", ".nc4", ".cdf", ".netcdf")
 OFF_SPHERE = 1e-5
 """Largest distance of a position from its sphere in units of the radius: round-off of float32, and more."""
 _SAME = 0.05

@@ -130,6 +130,12 @@ def read_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> np.ndarray:
         return _read(cast(BufferedIOBase, stream), info.filename, info.file_size)
 
 
+def array_names(path: Path) -> list[str]:
+    """Return the names of the arrays in a `.npz` file."""
+    with open_plain(path) as file, zipfile.ZipFile(file) as archive:
+        return [name.removesuffix(".npy") for name in archive.namelist()]
+
+
 def read_array(path: Path, member: str = "points") -> np.ndarray:
     """Read an array from a `.npy` file, or the array `member` from a `.npz` file.
 

@@ -387,12 +387,6 @@ def nan_in_row_3(values):
         (lambda c: None, {"n_cells": 0}, InputError, "n_cells"),
         (lambda c: None, {"n_cells": 3}, InputError, "at least 16: 4 for each of the 4 patches"),
         (lambda c: None, {"solver": "noSuchFoam"}, InputError, "not on the PATH"),
-        (
-            lambda c: None,
-            {"sizes": foam.FieldSizes(["k"])},
-            InputError,
-            "k has one value in all cells .*run the solver",
-        ),
         (lambda c: note(c, "{}"), {}, InputError, "the note of a cycle"),
         (lambda c: None, {"solver": "false"}, ClvoroError, "failed with code 1"),
         (lambda c: None, {"solver": lambda folder: None}, InputError, "no time after 5"),

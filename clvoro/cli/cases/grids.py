@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import warnings
-import zipfile
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,13 +11,12 @@ from typing import Any
 import numpy as np
 import scipy
 
+from ...earth.netcdf_read import NETCDF_SUFFIXES
 from ...errors import InputError
 from ...files import open_plain
-from ...io.arrays import FileError, explained, read_array
+from ...io.arrays import FileError, array_names, explained, read_array
 
 _LONGITUDES, _LATITUDES = ("lon", "longitude"), ("lat", "latitude")
-SUFFIXES = (".nc", ".nc4", ".cdf", ".netcdf")
-"""Suffixes of netCDF files."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +45,7 @@ def read_grid(path: Path, variable: str | None) -> Any:
     """
     if path.suffix.lower() == ".npz":
         return _from_npz(path, variable)
-    if path.suffix.lower() in SUFFIXES:
+    if path.suffix.lower() in NETCDF_SUFFIXES:
         return _from_netcdf(path, variable)
     return None
 
@@ -68,8 +66,8 @@ def _choose(variable: str | None, found: Mapping[Any, Any], shape: Callable[[Any
 
 
 def _from_npz(path: Path, variable: str | None) -> Labeled | None:
-    with explained(path, "a .npz file"), open_plain(path) as file, zipfile.ZipFile(file) as archive:
-        names = [name.removesuffix(".npy") for name in archive.namelist()]
+    with explained(path, "a .npz file"):
+        names = array_names(path)
     lon, lat = (next((n for n in names if n.lower() in known), None) for known in (_LONGITUDES, _LATITUDES))
     if lon is None or lat is None:
         if variable is None:
