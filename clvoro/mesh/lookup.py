@@ -207,7 +207,7 @@ def dual_triangles(diagram: Diagram) -> np.ndarray:
 def cell_shapes(diagram: Diagram, chosen: np.ndarray | None = None) -> np.ndarray:
     """Return each cell of a diagram in 2D, or of `chosen` rows, as a shapely geometry; see `Diagram.to_shapely`."""
     ends, following = diagram.half_faces.ends, diagram.half_faces.next
-    owner = np.repeat(np.arange(len(diagram)), np.diff(diagram.neighbor_starts))
+    owner = diagram.half_faces.owner
     # One loop follows the other; each ends where the next face is its first one.
     begins = np.concatenate([[True], following[:-1] != np.arange(1, len(following))])
     loop = np.cumsum(begins) - 1

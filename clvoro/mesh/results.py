@@ -292,8 +292,7 @@ def beside_boundary(result: Result) -> dict[str, dict[str, Any]]:
     d = result.diagram
     if not d.domain.cutting_edges:
         return {}
-    owner = np.repeat(np.arange(len(d)), np.diff(d.neighbor_starts))
-    on_boundary = np.bincount(owner, d.neighbors < 0, len(d)) > 0
+    on_boundary = np.bincount(d.half_faces.owner, d.neighbors < 0, len(d)) > 0
     found = {}
     at_corner = have_corners(d)
     for name, which in (("boundary", on_boundary), ("corner", at_corner), ("inner", ~on_boundary)):

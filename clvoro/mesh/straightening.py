@@ -52,9 +52,8 @@ def straighten(diagram: Diagram) -> Straightened:
     off. A ring that is a whole cell stays as it is, and holes within a cell are not sides. Cells with fewer than three
     sides remain as they are. In a box the sides are the faces.
     """
-    starts = diagram.neighbor_starts
-    counts, n = np.diff(starts), len(diagram)
-    owner, measures = np.repeat(np.arange(n), counts), diagram.face_measures
+    counts, n = np.diff(diagram.neighbor_starts), len(diagram)
+    owner, measures = diagram.half_faces.owner, diagram.face_measures
     perimeters = np.bincount(owner, measures, minlength=n)
     domain = diagram.domain.outline
     if domain is None:
@@ -100,7 +99,7 @@ def have_corners(diagram: Diagram) -> np.ndarray:
     """
     domain = diagram.domain.outline
     assert domain is not None
-    owner = np.repeat(np.arange(len(diagram)), np.diff(diagram.neighbor_starts))
+    owner = diagram.half_faces.owner
     following, edges = along_rings(diagram, domain), _places(diagram, domain)
     here = np.flatnonzero(following >= 0)
     there = following[here]

@@ -25,17 +25,15 @@ def take_subset(mesh: Mesh, keep: object, boundary: str) -> Mesh:
     """Return `mesh` without the cells where `keep` is False; see `MeshOutput.subset`."""
     diagram = mesh.diagram if isinstance(mesh, Result) else mesh
     diagram.demand_voronoi("subset")
-    globe = diagram.domain.globe
-    if isinstance(keep, Domain | Surface):
-        kept = _within(keep, diagram, globe)
-    else:
-        kept = check_mask("keep", keep, len(diagram))
+    shape = isinstance(keep, Domain | Surface)
+    kept = _within(keep, diagram) if shape else check_mask("keep", keep, len(diagram))
     if not kept.any():
         raise InputError(
             f"keep selects none of the {len(kept)} cells, expected at least one that is True; is it the opposite mask?"
         )
     if kept.all():
         return mesh
+    globe = diagram.domain.globe
     make = _in_space if globe is None else partial(_on_sphere, sphere=globe)
     part = make(diagram, kept, boundary)
     if not isinstance(mesh, Result):
@@ -45,7 +43,7 @@ def take_subset(mesh: Mesh, keep: object, boundary: str) -> Mesh:
     return cast("Mesh", dataclasses.replace(made, history=np.zeros(0, HISTORY_DTYPE), stop_reason=reason))
 
 
-def _within(shape: Domain | Surface, diagram: Diagram, globe: Sphere | None) -> np.ndarray:
+def _within(shape: Domain | Surface, diagram: Diagram) -> np.ndarray:
     """Return which generators of `diagram` lie inside of `shape`, (n,) bool.
 
     Raises
@@ -55,7 +53,7 @@ def _within(shape: Domain | Surface, diagram: Diagram, globe: Sphere | None) -> 
     """
     domain = diagram.domain
     if shape.dim != domain.dim:
-        remedy = _OTHER_SHAPES[domain.dim] if globe is None else "clvoro.earth.inside(mesh, keep)"
+        remedy = _OTHER_SHAPES[domain.dim] if domain.globe is None else "clvoro.earth.inside(mesh, keep)"
         raise InputError(
             f"keep is a {type(shape).__name__} with {shape.dim} coordinates, expected {domain.dim}, as the mesh has; "
             f"pass {remedy}"

@@ -24,8 +24,7 @@ cannot follow it exactly (in its own unit, which is up to twice the size of the 
 def check_outlines(check: Check) -> None:
     """Check that faces form loops, and that the corners of a cell follow the loops, with bridges there and back."""
     d = check.diagram
-    n, ends, following = len(d), d.half_faces.ends, d.half_faces.next
-    owner = np.repeat(np.arange(n), np.diff(d.neighbor_starts))
+    owner, ends, following = d.half_faces.owner, d.half_faces.ends, d.half_faces.next
     check.note(
         "faces closed",
         ends[:, 1] != ends[following, 0],
@@ -35,7 +34,7 @@ def check_outlines(check: Check) -> None:
     places = np.arange(1, len(corners) + 1)
     filled = starts[1:] > starts[:-1]
     places[starts[1:][filled] - 1] = starts[:-1][filled]
-    cell = np.repeat(np.arange(n), np.diff(starts))
+    cell = np.repeat(np.arange(len(d)), np.diff(starts))
     # Count each way from vertex to vertex, minus the ways back: the two ways of a bridge cancel.
     of = np.concatenate([owner, cell])
     a = np.concatenate([ends[:, 0], corners])
