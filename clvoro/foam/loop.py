@@ -87,8 +87,8 @@ class FieldSizes:
         Patches whose forces are the goal: cells near them count more (`force_weight`).
     adjoints : sequence of str
         Adjoint velocities among the case's fields, such as "Ua" of ``adjointOptimisationFoam``, one for each goal:
-        cells count by the gradient of these (`steepness`), the largest one. They have one unit, that of the goals: of
-        coefficients of forces, errors of .001 in each count alike. A goal counts more by the weight of its objective.
+        cells count by the largest gradient of these (`steepness`). They are compared as they are: equal errors of the
+        goals count alike, such as .001 of two coefficients. A larger weight of its objective makes a goal count more.
     p : float, optional
         As for `hessian_size`. By default 2, and 1 for a goal.
     h_min, h_max, growth : float

@@ -77,14 +77,14 @@ for _ in range(3):
     run.follow(sizes(mesh, bell(mesh.centroids)))
     mesh = run.finish()
 u = bell(mesh.centroids)
-total, frames = mesh.volumes @ u, [(mesh, u)]
+total = mesh.volumes @ u
 for part in range(PARTS):
     u = advance(mesh, u, turn)
     run.follow(sizes(mesh, u))
     after = run.finish()
     mesh, u = after, mesh.transfer(u, onto=after, order=2)
     if part == PARTS // 8 - 1:
-        frames.append((mesh, u))
+        early, values = mesh, u
 
 # %%
 # A uniform mesh of as many cells for comparison.
@@ -102,8 +102,7 @@ print(f"the integral is off by {mesh.volumes @ u / total - 1:.0e}, values from {
 # %%
 # After an eighth of the turn.
 
-frame, values = frames[1]
-frame.plot(values, key=False, center=(-60, 10), title=f"{len(frame):,} cells")
+early.plot(values, key=False, center=(-60, 10), title=f"{len(early):,} cells")
 plt.show()
 
 # %%
