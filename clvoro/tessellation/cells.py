@@ -21,6 +21,7 @@ from .builder import CellBuilder
 from .device_diagram import EXACT_SHARE, ROUGH_SHARE, CloseError, NeighborRows, OpenCellError, Tessellation
 from .face_rows import CROWDED, SLOT, FaceRows, spare_slots
 from .part import Part
+from .periodic.halo import halo_defines
 from .report import COINCIDE, DOUBT, FULL, KEPT, LOOPED, OPEN, SIZE, SLOTS, SPARE, WHOLE
 
 CELL_CAPACITY = 24
@@ -59,6 +60,7 @@ class Cells(CellBuilder):
     def __init__(self, engine: Engine, folded: bool = False) -> None:
         super().__init__(engine)
         self._folds = {f"FOLD_{a}": engine.traits.periods[a].hex() for a in range(2)} if folded else {}
+        self._halo = engine.kernels("tessellation/periodic/ghost_images", halo_defines(engine))
         self._enlarged_for = 0
         self._first_reports: dict[tuple[int, int, bool], cla.Array] = {}
         self._build(CELL_CAPACITY, ROW_CAPACITY)
@@ -104,6 +106,8 @@ class Cells(CellBuilder):
                 if not flags & ~DOUBT:
                     t = self.measure(taken, part.box, part.points, m, flags, exact)
                 if t is not None:
+                    if part.halo_args:
+                        self._request_depths(part, binned, t)
                     return t
                 if flags & OPEN:
                     raise OpenCellError(part.points[: part.count].get()[:, : engine.dim])
@@ -111,6 +115,21 @@ class Cells(CellBuilder):
                     raise CloseError(part.points, part.count)
                 # Too many short faces may have been dropped: keep all.
                 whole = True
+
+    def _request_depths(self, part: Part, binned: BinnedPoints, t: Tessellation) -> None:
+        """Request the depths of the halo that the cells of `t` require. In 3D the kernels that clip cells do this."""
+        engine = self.engine
+        engine.run_each(
+            self._halo.measure_required_depths,
+            part.count,
+            binned.items,
+            binned.reach,
+            part.points,
+            t.starts,
+            t.neighbors,
+            *part.box.device_corners(engine.real),
+            *part.halo_args,
+        )
 
     def _clip(self, rows: FaceRows, part: Part, binned: BinnedPoints, exact: bool) -> tuple[int, int]:
         """Build and match the faces of the first ``rows.n`` cells of `part`, and return what `_match` returns."""

@@ -82,9 +82,7 @@ class DomainSteps:
         """Return `rows` with neighbors that are rows of `part`."""
         return rows
 
-    def finish(
-        self, part: Part, binned: BinnedPoints, t: Tessellation, points: cla.Array, exact: bool, nearest: bool
-    ) -> Tessellation | None:
+    def finish(self, part: Part, t: Tessellation, points: cla.Array, exact: bool, nearest: bool) -> Tessellation | None:
         """Return the diagram of the domain from `t`, that of `part`; None if other ghosts are needed.
 
         Parameters

@@ -209,7 +209,7 @@ class Tessellator:
                 if not steps.drop_ghosts():
                     raise
                 continue
-            found = steps.finish(part, binned, t, points, exact, nearest)
+            found = steps.finish(part, t, points, exact, nearest)
             enough = found is not None
             if found is not None and (whole or not complete):
                 return replace(found, points=points, sites=sites)

@@ -10,7 +10,6 @@ import pyopencl.array as cla
 from ...geometry.domain import ClipBox, Domain
 from ...opencl.engine import Engine
 from ...opencl.primitives import NamedArrays, Scan
-from ..bins import BinnedPoints
 from ..cut_cells import CutCells
 from ..device_diagram import NeighborRows, Tessellation
 from ..part import Ghosts, Part
@@ -222,26 +221,17 @@ class GhostImages:
         )
 
     def reaches(self, part: Part, halo: Halo) -> bool:
-        """Return whether the halo was deep enough for the cells just built in 3D; store the depths they require."""
+        """Return whether the halo was deep enough for the cells just built; store the depths they require."""
         self._store_depths(part, halo)
         return not self._report.get()[0]
 
     def fold(
-        self,
-        part: Part,
-        halo: Halo,
-        binned: BinnedPoints,
-        t: Tessellation,
-        points: cla.Array,
-        share: float,
-        nearest: bool,
+        self, part: Part, halo: Halo, t: Tessellation, points: cla.Array, share: float, nearest: bool
     ) -> tuple[Tessellation, bool, int, int]:
         """Fold `t`, the diagram of `part`, whose ghosts are images in `halo`.
 
         Parameters
         ----------
-        binned : BinnedPoints
-            The generators and images.
         points : (n, d) real
             The generators.
         share : float
@@ -259,8 +249,6 @@ class GhostImages:
             `FAR`, `COLLAPSED` or both, and the first generator with such a face.
         """
         n = part.n_own
-        if self.engine.dim == 2:  # in 3D the kernels that clip cells do this
-            self._measure_depths(part, binned, t)
         self._store_depths(part, halo)
         m = int(t.starts[n].get())
         self._turn = 1 - self._turn
@@ -291,20 +279,6 @@ class GhostImages:
             # The next attempt writes to the same buffers, since it starts from the previous graph as well.
             self._turn = 1 - self._turn
         return folded, enough, int(words[1]) & ~DROPPED, int(words[2])
-
-    def _measure_depths(self, part: Part, binned: BinnedPoints, t: Tessellation) -> None:
-        """Request the depths that the cells of `t`, in 2D, require."""
-        self.engine.run_each(
-            self._kernels.measure_required_depths,
-            part.count,
-            binned.items,
-            binned.reach,
-            part.points,
-            t.starts,
-            t.neighbors,
-            *part.box.device_corners(self.engine.real),
-            *part.halo_args,
-        )
 
     def _fold_rows(
         self, part: Part, t: Tessellation, m: int, share: float, nearest: bool

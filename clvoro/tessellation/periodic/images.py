@@ -102,9 +102,7 @@ class Images(DomainSteps):
         """Return `rows` with the images in `part` as neighbors."""
         return self.stages.ghost_images.unfold(part, rows)
 
-    def finish(
-        self, part: Part, binned: BinnedPoints, t: Tessellation, points: cla.Array, exact: bool, nearest: bool
-    ) -> Tessellation | None:
+    def finish(self, part: Part, t: Tessellation, points: cla.Array, exact: bool, nearest: bool) -> Tessellation | None:
         """Fold `t`; None if the halo was not deep enough. It will be deeper.
 
         Raises
@@ -115,9 +113,8 @@ class Images(DomainSteps):
             If a neighbor is not the nearest image of its generator.
         """
         share = EXACT_SHARE if exact else ROUGH_SHARE
-        folded, enough, flags, generator = self.stages.ghost_images.fold(
-            part, self._halo, binned, t, points, share, nearest
-        )
+        fold = self.stages.ghost_images.fold
+        folded, enough, flags, generator = fold(part, self._halo, t, points, share, nearest)
         if not enough:
             self._factor, self._grow = 1.0 if self._room > 0 else LAST_FACTOR, True
             return None

@@ -158,8 +158,8 @@ class Folding:
         given.halo.required.fill(WHOLE)
         given.extend()
         self.images = images = given.images
-        self.binned = given.stages.bins.build(images.box, images.points, images.count)
-        self.t = given.stages.cells.tessellate(images, self.binned, exact=False, rows=n)
+        binned = given.stages.bins.build(images.box, images.points, images.count)
+        self.t = given.stages.cells.tessellate(images, binned, exact=False, rows=n)
         self.n, self.starts = n, self.t.starts.get()
         self.m = int(self.starts[n])
         self.neighbors, self.measures = self.t.neighbors.get(), self.t.face_measures.get()
@@ -196,7 +196,7 @@ class Folding:
         )
         ghost_images = self.given.ghost_images
         ghost_images._report.set(np.array([0, 0, 2**31 - 1], np.int32))  # of the images, of which there is one diagram
-        return ghost_images.fold(self.images, self.given.halo, self.binned, changed, self.given.x, share, nearest)
+        return ghost_images.fold(self.images, self.given.halo, changed, self.given.x, share, nearest)
 
     def far(self, neighbors):
         """Return the generators with a neighbor that is not the nearest image."""

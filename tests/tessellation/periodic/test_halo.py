@@ -218,7 +218,7 @@ def is_enough(stages, ghost_images: GhostImages, box, x, n, halo):
     images = ghost_images.extend(box, x, n, halo, 1.0, False)
     binned = stages.bins.build(images.box, images.points, images.count)
     t = stages.cells.tessellate(images, binned, exact=False, rows=n)
-    return ghost_images.fold(images, halo, binned, t, x, 0.5, True)[1]
+    return ghost_images.fold(images, halo, t, x, 0.5, True)[1]
 
 
 @pytest.mark.sparse(2)
