@@ -134,11 +134,7 @@ def _reader(path: Path) -> Callable[[Path, tuple[str, ...] | None, float | None]
         return _of_netcdf
     if kind in _TABLES:
         return _of_table
-    if kind == ".npz":
-        return _of_clvoro if is_kind(path, FORMAT) else _of_arrays
-    if kind == ".vtu":
-        return _of_meshio if cell_data_of_vtu(path, ()) is None else _of_clvoro
-    return _of_meshio
+    return {".npz": _of_npz, ".vtu": _of_vtu}.get(kind, _of_meshio)
 
 
 def _chosen(wanted: Iterable[str] | None, present: Iterable[str]) -> list[str]:
@@ -162,17 +158,24 @@ def _refuse_time(time: float | None) -> None:
         raise FileError(f"it has no times, and time is {time:g}; leave it out")
 
 
-def _of_clvoro(path: Path, wanted: tuple[str, ...] | None, time: float | None) -> _Found:
+def _of_npz(path: Path, wanted: tuple[str, ...] | None, time: float | None) -> _Found:
+    if not is_kind(path, FORMAT):
+        return _of_arrays(path, wanted, time)
+    there = {n.removeprefix("cell_data."): n for n in array_names(path) if n.startswith("cell_data.")}
+    return _of_clvoro(path, {n: read_array(path, there[n]).astype(float) for n in _chosen(wanted, there)}, time)
+
+
+def _of_vtu(path: Path, wanted: tuple[str, ...] | None, time: float | None) -> _Found:
+    there = cell_data_of_vtu(path)
+    if there is None:
+        return _of_meshio(path, wanted, time)
+    return _of_clvoro(path, {n: there[n] for n in _chosen(wanted, there)}, time)
+
+
+def _of_clvoro(path: Path, values: dict[str, np.ndarray], time: float | None) -> _Found:
     _refuse_time(time)
     made = load(path)
     mesh = made.diagram if isinstance(made, Result) else made
-    if path.suffix.lower() == ".npz":
-        there = {n.removeprefix("cell_data."): n for n in array_names(path) if n.startswith("cell_data.")}
-        values = {n: read_array(path, there[n]).astype(float) for n in _chosen(wanted, there)}
-    else:
-        values = cell_data_of_vtu(path, wanted) or {}
-        there = values if wanted is None or len(values) == len(set(wanted)) else cell_data_of_vtu(path, None) or {}
-        values = {n: values[n] for n in _chosen(wanted, {**values, **there})}
     return _Found({n: _of_dimension(rows, mesh.domain.dim) for n, rows in values.items()}, mesh=mesh)
 
 

@@ -12,7 +12,7 @@ import struct
 import sys
 import zlib
 from array import array
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from io import BufferedReader
 from itertools import pairwise
 from os import PathLike
@@ -61,7 +61,7 @@ _USED = {
 }
 
 _TOPOLOGY = {"generator", "weight", "label", "sides", "faces_of_cell"}
-"""Cell data that are no fields."""
+"""Cell data that are no fields, and so are those that begin with ``boundary:``."""
 
 
 class FileReader:
@@ -199,8 +199,8 @@ def load_vtu(path: str | PathLike[str]) -> Result | Diagram:
         return _assemble(arrays)
 
 
-def cell_data_of_vtu(path: str | PathLike[str], wanted: Iterable[str] | None) -> dict[str, np.ndarray] | None:
-    """Return cell data of a file of clvoro by name, those that are there; None for files of other programs."""
+def cell_data_of_vtu(path: str | PathLike[str]) -> dict[str, np.ndarray] | None:
+    """Return the fields among the cell data of a file of clvoro, by name; None for files of other programs."""
     with open_plain(path) as file:
         try:
             reader = _open(file)
@@ -208,9 +208,9 @@ def cell_data_of_vtu(path: str | PathLike[str], wanted: Iterable[str] | None) ->
             return None
         if "FieldData.domain" not in reader.entries:
             return None
-        there = {key.removeprefix("CellData."): key for key in reader.entries if key.startswith("CellData.")}
-        chosen = [n for n in there if n not in _TOPOLOGY and ":" not in n] if wanted is None else wanted
-        return {n: reader.read(file, there[n]).astype(float) for n in chosen if n in there}
+        names = [key.removeprefix("CellData.") for key in reader.entries if key.startswith("CellData.")]
+        fields = [name for name in names if name not in _TOPOLOGY and not name.startswith("boundary:")]
+        return {name: reader.read(file, f"CellData.{name}").astype(float) for name in fields}
 
 
 def _open(file: BufferedReader) -> FileReader:
