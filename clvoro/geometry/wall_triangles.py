@@ -64,7 +64,6 @@ class WallTriangles:
         self.normals = np.asarray(normals, float)[kept]
         self.edges, self.ends = np.asarray(edges)[kept], np.asarray(ends)[kept]
         self._known: WeakKeyDictionary[Workspace, dict[object, tuple[object, ...]]] = WeakKeyDictionary()
-        self._trees: WeakKeyDictionary[Workspace, dict[object, tuple[object, ...]]] = WeakKeyDictionary()
 
     def __len__(self) -> int:
         return len(self.patch)
@@ -118,8 +117,8 @@ class WallTriangles:
 
     def tree_arguments(self, engine: Engine, frame: tuple[np.ndarray, float]) -> tuple[object, ...]:
         """Return WALL_TREE_ARGS in the coordinates of `frame`; see geometry/wall_tree.h."""
-        there = self._trees.setdefault(engine.workspace, {})
-        if engine.real not in there:
+        there, name = self._known.setdefault(engine.workspace, {}), ("tree", engine.real)
+        if name not in there:
             corners = np.asarray((self.corners - frame[0]) / frame[1], engine.real)
             n = len(self)
             tree = Tree(corners.min(axis=1), corners.max(axis=1), order=np.arange(n))
@@ -128,13 +127,13 @@ class WallTriangles:
             first, last = self.patch[first], self.patch[last - 1]
             boxes = np.zeros((len(first), 8))
             boxes[:, :3], boxes[:, 4:7] = tree.boxes[:, :3], tree.boxes[:, 3:]
-            there[engine.real] = (
+            there[name] = (
                 np.array([n, tree.levels], np.int32),
                 engine.upload(boxes),
                 engine.upload(np.where(first == last, first, -1), np.int32),
                 engine.upload(self.planes(frame)),
             )
-        return there[engine.real]
+        return there[name]
 
 
 def mean_curvature(corners: np.ndarray, normals: np.ndarray) -> np.ndarray:
