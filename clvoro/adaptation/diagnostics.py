@@ -4,21 +4,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
 from ..arguments import format_point, warn
 from ..errors import InputError, MismatchWarning, ObtuseTrianglesWarning, PrecisionWarning, SizeErrorWarning
-from ..geometry.boundary_layers import Layers, columns_of
+from ..geometry.boundary_layers import Layers, columns_of, sample_walls
 from ..geometry.domain import Domain
 from ..mesh.diagram import Diagram
 from ..mesh.results import Result
 from ..sizing import Sizing
 from ..sizing.field import Field
-
-if TYPE_CHECKING:
-    from ..geometry.surface import Surface
 
 COARSER, FINER = 2.0, 1e-3
 """Ratios of the sizes of layers and of the field beside them that indicate a mistake."""
@@ -141,9 +137,8 @@ def layer_mismatches(name: str, layer: Layers, field: Field, domain: Domain) -> 
 
 
 def _prism_mismatches(name: str, layer: Layers, field: Field, domain: Domain) -> list[str]:
-    """Return warnings if prisms are far thicker or flatter than the cells beside them."""
-    walls = cast("Surface", domain.boundary(layer.edges))
-    h = np.asarray(field(walls.landmarks(float(domain.extent.min()) / 8, SAMPLE)), float)
+    """Return warnings if prisms are far thicker or thinner than the cells beside them."""
+    _, h = sample_walls(domain, layer, field, SAMPLE)
     smallest, largest = float(h.min()), float(h.max())
     if layer.thickness > THICKEST * smallest:
         return [

@@ -377,12 +377,19 @@ def check_extruded(domain: Domain, layers: Sequence[Layers]) -> None:
         )
 
 
+def sample_walls(
+    domain: Domain, layer: Layers, size: Callable[[np.ndarray], np.ndarray], most: int
+) -> tuple[Surface, np.ndarray]:
+    """Return the walls of a solid that have `layer`, and `size` at up to `most` points on them, (k,) float."""
+    walls = cast("Surface", domain.boundary(layer.edges))
+    return walls, np.asarray(size(walls.landmarks(float(domain.extent.min()) / 8, most)), float)
+
+
 def count_prisms(domain: Domain, layers: Sequence[Layers], size: Callable[[np.ndarray], np.ndarray]) -> float:
     """Return about how many prisms `layers` of a solid have, where wall polygons are as wide as `size` at points."""
     total = 0.0
     for layer in layers:
-        walls = cast("Surface", domain.boundary(layer.edges))
-        h = np.asarray(size(walls.landmarks(float(domain.extent.min()) / 8, _SAMPLE)), float)
+        walls, h = sample_walls(domain, layer, size, _SAMPLE)
         area = float(np.linalg.norm(np.cross(*np.diff(walls.corners, axis=1).swapaxes(0, 1)), axis=1).sum()) / 2
         total += layer.count * area * float((h**-2).mean())
     return total
