@@ -42,6 +42,8 @@ _FEW = 0.03
 """Largest share of generators without a cell; a solid with more of them is refused."""
 _PATIENCE, _ATTEMPTS = 3, 8
 """How often a mesh is made again without fewer rejected cells than before, and at all."""
+_ROUNDING = 1e-9
+"""Changes of meshes that are only rounding, over the extent of the solid."""
 _MISSED = 0.1
 """A crossing of a crease becomes a vertex of a chord on its face that is farther from it than this share of h."""
 
@@ -68,10 +70,15 @@ class _Made:
     rejected: np.ndarray
 
     def is_like(self, other: _Made) -> bool:
-        """Return whether both have the same faces, to the bit."""
-        return all(
-            np.array_equal(getattr(self.faces, name), getattr(other.faces, name)) for name in ("corners", "points")
-        )
+        """Return whether both have the same faces, up to rounding."""
+        one, two = self.faces, other.faces
+        if one.points.shape != two.points.shape or not all(
+            np.array_equal(getattr(one, name), getattr(two, name)) for name in ("owner", "neighbor")
+        ):
+            return False
+        size = float(np.ptp(one.points, axis=0).max())
+        pairs = ((one.points / size, two.points / size), (one.vectors[1] / size**2, two.vectors[1] / size**2))
+        return all(np.allclose(a, b, rtol=0, atol=_ROUNDING) for a, b in pairs)
 
 
 def outer_generators(surface: WallSurface, points: np.ndarray, sizes: np.ndarray) -> np.ndarray:
@@ -165,26 +172,30 @@ def solid_diagram(
     near = NearWalls.of(surface, points, sizes, whole)
     del whole
     walls = np.full(len(near.sizes), EXACT, np.int8)
-    best, kept = None, walls
+    best, raw_best, kept = None, None, walls
     since = 0
     for attempt in range(1, _ATTEMPTS + 1):
         if since == _PATIENCE:
             break
         number = "" if attempt == 1 else f", attempt {attempt}"
         try:
-            made = _made(surface, near, walls, lambda part, number=number: tell(part + number))
+            tell(f"walls of {len(near.rows)} cells{number}")
+            raw = _Maker(surface, near, walls).mesh()
+            _check_lost(surface, near, raw.home)
         except InputError:  # a simpler cell of a thin part may be nothing
             if best is None:
                 raise
             break
-        if best is not None and made.is_like(best):
-            # Without creases there the next attempts are the same.
-            places = made.faces.generators[made.rejected]
-            if (surface.nearest_crease(places, 3 * near.sizes[made.home[made.rejected]])[0] < 0).all():
-                break
         since += 1
-        if best is None or len(made.rejected) < len(best.rejected):
-            best, kept, since = made, walls.copy(), 0
+        if best is None or raw_best is None or not raw.is_like(raw_best):
+            made = _finished(surface, near, raw, lambda part, number=number: tell(part + number))
+            if best is None or len(made.rejected) < len(best.rejected):
+                best, raw_best, kept, since = made, raw, walls.copy(), 0
+        else:
+            made = best
+            places = best.faces.generators[best.rejected]
+            if (surface.nearest_crease(places, 3 * near.sizes[best.home[best.rejected]])[0] < 0).all():
+                break  # without creases there the next attempts are the same
         if not len(made.rejected):
             break
         _simplify(walls, near, np.unique(made.home[made.rejected]))
@@ -210,11 +221,8 @@ def solid_diagram(
     return diagram
 
 
-def _made(surface: WallSurface, near: NearWalls, walls: np.ndarray, tell: Callable[[str], object]) -> _Made:
-    """Return the cells near the surface without short edges and slivers; `walls` (p + 1,) says how they are made."""
-    tell(f"walls of {len(near.rows)} cells")
-    raw = _Maker(surface, near, walls).mesh()
-    home, own = raw.home, raw.own
+def _check_lost(surface: WallSurface, near: NearWalls, home: np.ndarray) -> None:
+    """Raise an `InputError` if many generators have no cell; `home` is that of the cells."""
     lost = np.setdiff1d(np.arange(len(near.rows)), home)
     if len(lost) > _FEW * len(near.points):
         place = format_point(near.generators[lost[0]])
@@ -222,6 +230,11 @@ def _made(surface: WallSurface, near: NearWalls, walls: np.ndarray, tell: Callab
             f"{surface.solid} is too thin for cells of this size: {len(lost)} generators have no cell, the first at "
             f"{place}, where h is {near.sizes[lost[0]]:.3g}; use smaller cells there"
         )
+
+
+def _finished(surface: WallSurface, near: NearWalls, raw: _Made, tell: Callable[[str], object]) -> _Made:
+    """Return `raw` cells near the surface without short edges and slivers, cured where OpenFOAM rejects them."""
+    home, own = raw.home, raw.own
     tell("short edges at walls")
     faces = _collapsed(raw.faces, near.sizes[home])
     tell("checks of cells at walls")
