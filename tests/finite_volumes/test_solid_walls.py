@@ -246,6 +246,35 @@ def test_a_cut_makes_two_convex_cells_of_one(ctx):
     assert min(found) == 0
 
 
+def test_mergers_losses_and_collapses_change_what_they_name(ctx):
+    """With sizes three times as large, cells and edges count as small. Faces that are joined are not quite flat."""
+    cures, _ = l_cell(ctx)
+    edits, cures.sizes = cures.edits, 3 * cures.sizes
+    cell = int(edits.mesh.owner[edits.mesh.n_inner])
+
+    def volume(e, cells):
+        return sum(cures._volume(e, c) for c in e.alive(cells))
+
+    merged, lost = next(cures.mergers(edits, cell)), next(cures.losses(edits, cell))
+    for trial, less in ((merged, 0), (lost, volume(edits, [cell]))):
+        assert not trial.faces_of(cell)
+        assert all(trial.is_sound(c) for c in trial.touched)
+        assert volume(trial, trial.touched) == pytest.approx(volume(edits, trial.touched) - less, rel=0.01)
+    counts = [len(t.vertices(cell)) for t in cures.collapses(edits, cell) if t.is_sound(cell)]
+    assert 3 < min(counts) <= max(counts) < len(edits.vertices(cell))
+
+
+def test_parts_in_trials_that_are_dropped_leave_no_trace(ctx):
+    """The same number of a new cell is that of parts of different cells in different trials."""
+    cures, cells = l_cell(ctx)
+    edits = cures.edits
+    one, other = (next(cures.cuts(edits, c)) for c in cells[:2])
+    assert one.origins == {edits.next_cell: cells[0]}
+    assert other.origins == {edits.next_cell: cells[1]}
+    edits.take(one)
+    assert edits.origins == one.origins
+
+
 @pytest.mark.parametrize("seed", [0, 47, 63, 69, 93])
 def test_few_cells_in_thin_solids(ctx, seed):
     """They are meshed, or refused with a place, also if there are fewer cells than walls."""
