@@ -40,8 +40,9 @@ def spoilt(result, **changes):
     diagram = result if isinstance(result, Diagram) else result.diagram
     arrays = arrays_of(diagram)
     for name, change in changes.items():
-        changed = change(arrays[name])
-        arrays[name] = arrays[name] if changed is None else changed
+        array = arrays.get(name, getattr(diagram, name).copy())  # those that are not stored follow from others
+        changed = change(array)
+        arrays[name] = array if changed is None else changed
     return Diagram(diagram.domain, arrays)
 
 
