@@ -69,28 +69,12 @@ def test_peers():
 
 
 @pytest.mark.slow
-def test_faults():
-    assert all(r["right"] for r in records("faults.py", "--only", "dangle,pieces,units,tile"))
-
-
-@pytest.mark.slow
 def test_restart():
     cold, *moved = records("restart.py", "--moves", "2")
     assert cold["steps"] > 100
     assert len(moved) == 2
     assert all(r["to_tolerance"] <= 5 for r in moved)
     assert all(r["mass"] < 1e-12 for r in moved)
-
-
-@pytest.mark.slow
-def test_clusters():
-    rows = records("clusters.py", "--sets", "3")
-    rows += records("clusters.py", "--sets", "3", "--dim", "3", "--kinds", "spheres,rings")
-    assert len(rows) == 18
-    assert all(r["wrong"] == 0 for r in rows)
-    # In 3D generators of random rings may be closer than single precision can separate.
-    certain = [r for r in rows if (r["generators"], r["dtype"]) != ("rings", "float32")]
-    assert all(r["meshes"] == r["sets"] == 3 for r in certain)
 
 
 @pytest.mark.slow
@@ -161,18 +145,6 @@ def test_a_table_is_markdown():
     lines = [line for line in done.stdout.splitlines() if line.startswith("|")]
     assert len(lines) == 5
     assert len({line.count("|") for line in lines}) == 1
-
-
-@pytest.mark.slow
-def test_scaling(tmp_path):
-    pytest.importorskip("matplotlib")
-    rows = records(
-        "scaling.py", "--sizes", "500,1e3", "--solid-sizes", "500,1e3", "--run-sizes", "500,1e3", "--out", str(tmp_path)
-    )
-    names = {r["curve"] for r in rows}
-    assert {"diagram", "next diagram", "3D diagram", "Poisson", "fast run", "default run"} <= names
-    assert all(len(r["cells"]) == len(r["seconds"]) == 2 and r["slope"] is None for r in rows)
-    assert (tmp_path / "scaling.png").read_bytes()[:4] == b"\x89PNG"
 
 
 @pytest.mark.slow
