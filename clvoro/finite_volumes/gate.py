@@ -214,16 +214,17 @@ def judged_thoroughly(mesh: Faces) -> tuple[np.ndarray, np.ndarray]:
     return cells, cells[mesh.owner] & (cells[np.maximum(mesh.neighbor, 0)] | (mesh.neighbor < 0))
 
 
-def rejected_cells(mesh: Faces, judged: np.ndarray) -> np.ndarray:
-    """Return which cells OpenFOAM rejects in 3D, (n,) bool: also those with a face that it rejects.
+def rejected_cells(mesh: Faces, divided: np.ndarray, judged: np.ndarray) -> np.ndarray:
+    """Return which of the cells `judged` (n,) OpenFOAM rejects in 3D, (n,) bool: also those with a face it rejects.
 
-    Only the faces `judged` (k,) are divided into tetrahedra, which takes the longest.
+    Only the faces `divided` (k,) are divided into tetrahedra, which takes the longest.
     """
-    m, faces = mesh.measures, np.zeros(len(mesh), bool)
+    m, faces, found = mesh.measures, np.zeros(len(mesh), bool), np.zeros(mesh.n_cells, bool)
     cells, between = judged_thoroughly(mesh)
-    judged = judged[between[judged]]
-    faces[judged] = m.bad_tetrahedra_of(judged) > 0
-    return m.concave & cells | cells_beyond(m, (*OF_CONVEX, "volumes", "face_areas", "pyramids"), faces)
+    divided = divided[between[divided]]
+    faces[divided] = m.bad_tetrahedra_of(divided) > 0
+    found[m.concave_pairs(judged=judged & cells)[1]] = True
+    return (found | cells_beyond(m, (*OF_CONVEX, "volumes", "face_areas", "pyramids"), faces)) & judged
 
 
 def rejected_polygons(mesh: Faces) -> np.ndarray:

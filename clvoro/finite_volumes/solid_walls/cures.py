@@ -16,7 +16,7 @@ import numpy as np
 from ...mesh.faces import Faces
 from .cutting import CellCut, planes_through
 from .editing import Edge, Edits, area_of, between, edges_of, judge
-from .mend import rejected_at_walls
+from .mend import rejected_at_walls, with_neighbors
 from .wall_surface import WallSurface
 
 _SNAPS = (0.1, 0.03)
@@ -394,17 +394,18 @@ def cured(
     if len(rejected) > _TOO_MANY * faces.n_cells:
         return faces, home, own, rejected
     cures = Cures(surface, faces, sizes)
-    todo, changed = rejected.tolist(), True
-    while changed:
-        changed = False
+    todo, again = rejected.tolist(), True
+    while again:
+        again = False
         for cell in todo:
             for _ in range(_BUDGET):
                 if not cures.cure(cell):
                     break
-                changed = True
+                again = True
         todo = cures.edits.alive({*rejected.tolist(), *cures.edits.touched})
     made, cells = cures.edits.result()
-    left = rejected_at_walls(made)
+    changed = np.isin(cells, [*rejected.tolist(), *cures.edits.touched])
+    left = rejected_at_walls(made, with_neighbors(made, changed))
     if len(left) > len(rejected):
         return faces, home, own, rejected
     origin = np.array([cures.edits.origins.get(c, c) for c in cells.tolist()])

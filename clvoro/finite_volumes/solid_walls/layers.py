@@ -574,7 +574,7 @@ class _LayeredWalls:
     def _rejected_of(self, faces: Faces, judged: np.ndarray, kept: np.ndarray) -> np.ndarray:
         """Return which of the cells `judged` (n,) OpenFOAM rejects; measures are those of the cells `kept`."""
         part, found = faces.part(kept)[0], np.zeros(faces.n_cells, bool)
-        bad = rejected_cells(part, np.arange(len(part)))
+        bad = rejected_cells(part, np.arange(len(part)), judged[kept])
         steep = part.measures.non_orthogonality > _STEEP
         bad[part.owner[steep]] = bad[part.neighbor[steep]] = True  # no wall has an angle
         if part.layer is not None:  # thinner prisms would not be better

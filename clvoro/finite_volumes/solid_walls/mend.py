@@ -12,33 +12,61 @@ _NARROW = 0.08
 """Faces between two cells are collapsed if they are smaller than this share of h^2 and a cell is concave there."""
 
 
-def narrow_faces(faces: Faces, sizes: np.ndarray) -> np.ndarray:
+def narrow_faces(faces: Faces, sizes: np.ndarray, among: np.ndarray | None = None) -> np.ndarray:
     """Return the small faces between two cells at a wall with which a cell is concave, (f,) bool.
 
     Where a wall is curved, the common edge of two wall polygons may bulge out of the planes of both. So does the center
     of the face between their cells if that is small.
+
+    Parameters
+    ----------
+    faces : Faces
+    sizes : (n,) float
+        h of the cells.
+    among : (n,) bool, optional
+        The cells that are searched; by default all.
     """
-    at_wall = np.zeros(faces.n_cells, bool)
-    at_wall[faces.owner[faces.n_inner :]] = True
+    searched = _at_wall(faces) if among is None else _at_wall(faces) & among
     chosen = np.zeros(len(faces), bool)
-    chosen[faces.measures.concave_pairs(DefectLimits().concavity, at_wall)[0]] = True
+    chosen[faces.measures.concave_pairs(DefectLimits().concavity, searched)[0]] = True
     chosen[faces.n_inner :] = False
     h = np.minimum(sizes[faces.owner], sizes[np.maximum(faces.neighbor, 0)])
     return chosen & (faces.area < _NARROW * h**2)
 
 
-def rejected_at_walls(faces: Faces) -> np.ndarray:
-    """Return the cells at walls, or beside these, that OpenFOAM rejects, (k,) int."""
-    k = faces.n_inner
-    a, b = faces.owner[:k], faces.neighbor[:k]
-    rings = [np.zeros(faces.n_cells, bool)]
-    rings[0][faces.owner[k:]] = True
-    for _ in range(2):
-        ring = rings[-1].copy()
-        ring[a[rings[-1][b]]] = ring[b[rings[-1][a]]] = True
-        rings.append(ring)
-    cells, part = np.flatnonzero(rings[2]), faces.part(rings[2])[0]
+def rejected_at_walls(faces: Faces, among: np.ndarray | None = None) -> np.ndarray:
+    """Return the cells at walls, or beside these, that OpenFOAM rejects, (k,) int.
+
+    Parameters
+    ----------
+    faces : Faces
+    among : (n,) bool, optional
+        The cells that are judged; by default all.
+    """
+    at_wall = _at_wall(faces)
+    mine = with_neighbors(faces, at_wall)
+    if among is not None:
+        mine &= among
+    kept = with_neighbors(faces, mine)
+    cells, part = np.flatnonzero(kept), faces.part(kept)[0]
     # Other faces are those of the diagram, whose tetrahedra are right.
-    at_wall = rings[0][cells]
-    judged = np.flatnonzero(at_wall[part.owner] | (at_wall[np.maximum(part.neighbor, 0)] & (part.neighbor >= 0)))
-    return cells[rejected_cells(part, judged) & rings[1][cells]]
+    doubtful = at_wall[cells]
+    tested = np.flatnonzero(doubtful[part.owner] | (doubtful[np.maximum(part.neighbor, 0)] & (part.neighbor >= 0)))
+    return cells[rejected_cells(part, tested, mine[cells])]
+
+
+def with_neighbors(faces: Faces, cells: np.ndarray, rings: int = 1) -> np.ndarray:
+    """Return the `cells` (n,) bool with their neighbors, the neighbors of these, and so on, (n,) bool."""
+    a, b = faces.owner[: faces.n_inner], faces.neighbor[: faces.n_inner]
+    for _ in range(rings):
+        ring = cells.copy()
+        ring[a[cells[b]]] = ring[b[cells[a]]] = True
+        cells = ring
+    return cells
+
+
+def _at_wall(faces: Faces) -> np.ndarray:
+    """Return which cells have a wall, (n,) bool."""
+    found = np.zeros(faces.n_cells, bool)
+    found[faces.owner[faces.n_inner :]] = True
+    return found

@@ -17,7 +17,7 @@ from ...mesh.faces import Faces
 from ..collapse import collapse_short
 from .chains import Crossings, cross_cells
 from .cures import cured
-from .mend import narrow_faces, rejected_at_walls
+from .mend import narrow_faces, rejected_at_walls, with_neighbors
 from .near_walls import NearWalls
 from .pierce import IN, WALL, pierce_edges, sides, simplified
 from .polygons import Divider, chain_loops, open_sides
@@ -44,6 +44,8 @@ _PATIENCE, _ATTEMPTS = 3, 8
 """How often a mesh is made again without fewer rejected cells than before, and at all."""
 _ROUNDING = 1e-9
 """Changes of meshes that are only rounding, over the extent of the solid."""
+_RINGS = 3
+"""Rings of cells whose shapes, or neighbors' shapes, may change where edges of a cell are collapsed."""
 _MISSED = 0.1
 """A crossing of a crease becomes a vertex of a chord on its face that is farther from it than this share of h."""
 
@@ -240,8 +242,12 @@ def _finished(surface: WallSurface, near: NearWalls, raw: _Made, tell: Callable[
     tell("checks of cells at walls")
     rejected = rejected_at_walls(faces)
     if len(rejected):  # where a face has been collapsed, another small one may bulge out
-        faces = _collapsed(faces, near.sizes[home])
-        rejected = rejected_at_walls(faces)
+        around = np.zeros(faces.n_cells, bool)
+        around[rejected] = True
+        around = with_neighbors(faces, around)
+        again = _collapsed(faces, near.sizes[home], around)
+        rejected = rejected_at_walls(again, with_neighbors(faces, around, _RINGS))
+        faces = again
     if len(rejected):
         tell("cells that are rejected at walls")
         faces, home, own, rejected = cured(surface, faces, home, own, near.sizes[home], rejected)
@@ -251,13 +257,18 @@ def _finished(surface: WallSurface, near: NearWalls, raw: _Made, tell: Callable[
     return _Made(faces, home, own, rejected)
 
 
-def _collapsed(faces: Faces, sizes: np.ndarray) -> Faces:
-    """Return a mesh without short edges and small faces of cells at walls, and without faces that bulge out."""
+def _collapsed(faces: Faces, sizes: np.ndarray, among: np.ndarray | None = None) -> Faces:
+    """Return a mesh without short edges and small faces of cells at walls, and without faces that bulge out.
+
+    Cells that are not `among` (n,) bool stay as they are, but for the vertices that they share with the others.
+    """
     diagram = diagram_of(faces)
     at_wall = np.zeros(faces.n_cells, bool)
     at_wall[faces.owner[faces.n_inner :]] = True
+    if among is not None:
+        at_wall &= among
     chosen = at_wall[faces.owner] | at_wall[np.maximum(faces.neighbor, 0)]
-    made = collapse_short(diagram.faces, diagram, narrow_faces(diagram.faces, sizes), chosen)
+    made = collapse_short(diagram.faces, diagram, narrow_faces(diagram.faces, sizes, among), chosen)
     row = np.full(len(diagram.neighbors), -1)
     row[diagram.faces.half_face] = faces.half_face
     return replace(made, half_face=row[made.half_face])
