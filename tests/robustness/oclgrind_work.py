@@ -1,6 +1,6 @@
 """Small work for every kernel on the simulator Oclgrind: `python -m tests.robustness.oclgrind_work NAME [OPTION ...]`.
 
-Prints one JSON object: for each kind of domain which kernels have run in it ("file.kernel"), and how often.
+Prints one JSON object: which kernels have run ("file.kernel"), and how often.
 `tests/robustness/test_oclgrind.py` starts it and reads the simulator's log. Options: `float32`; `groups`, work-groups
 as on a GPU (16 work-items, with local memory and barriers) instead of a CPU's groups of one; `teams`, cells in 3D by
 teams of work-items.
@@ -14,7 +14,6 @@ import sys
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
-from types import SimpleNamespace
 from unittest import mock
 
 import numpy as np
@@ -26,7 +25,6 @@ from clvoro.adaptation.insertion_deletion import CellSizes, Change, Generators, 
 from clvoro.adaptation.stages import Stages
 from clvoro.opencl import program as _program
 from clvoro.opencl.engine import Engine
-from clvoro.opencl.kernels import Kernels
 from clvoro.opencl.primitives import Scan
 from clvoro.sizing import Ball, Circle, ClosedPolyline, Distance, Expression, Graded, Raster, Sizing, Surface, minimum
 from clvoro.tessellation import back_ends
@@ -514,40 +512,6 @@ def buffers_of_their_own() -> Callable[[], None]:
     return lambda: setattr(Engine, "scratch", shared)
 
 
-def domain_of(engine: Engine) -> str:
-    """Return the kind of domain that an engine is for: "plane", "torus", "polygon", "sphere", ...
-
-    Engines for power diagrams have "weighted" before it.
-    """
-    macros = engine.traits.macros
-    if "SPHERE" in macros:
-        name = "sphere"
-    elif engine.dim == 3:
-        name = "periodic space" if "PERIODIC" in macros else "space"
-    else:
-        name = "torus" if "PERIODIC" in macros else "polygon" if "POLYGON" in macros else "plane"
-    return f"weighted {name}" if "WEIGHTED" in macros else name
-
-
-def name_domains() -> None:
-    """Record for each kernel the kind of `domain` of its engine; "none" for kernels without one."""
-    plain = Engine.kernels
-
-    def named(self: Engine, *args: object, **options: object) -> Kernels:
-        kernels, domain = plain(self, *args, **options), domain_of(self)
-        pool = kernels._pool  # engines of several kinds share it
-
-        def take(program: cl.Program, name: str) -> cl.Kernel:
-            kernel = pool.take(program, name)
-            kernel.domain = domain
-            return kernel
-
-        kernels._pool = SimpleNamespace(take=take)
-        return kernels
-
-    Engine.kernels = named
-
-
 def build_for_simulator() -> None:
     """Build programs without optimization that Oclgrind does not run right with it.
 
@@ -568,13 +532,13 @@ def build_for_simulator() -> None:
 
 def main(name: str, *options: str) -> None:
     context = clvoro.create_context("oclgrind")
-    counts = collections.defaultdict(collections.Counter)
+    counts = collections.Counter()
     original = cl.enqueue_nd_range_kernel
 
     def counted(queue, kernel, *rest, **more):
         # Kernels of several files share names; PyOpenCL's own know no stage.
         full = f"{getattr(kernel, 'stage', 'pyopencl')}.{kernel.function_name}"
-        counts[getattr(kernel, "domain", "none")][full] += 1
+        counts[full] += 1
         return original(queue, kernel, *rest, **more)
 
     cl.enqueue_nd_range_kernel = counted
@@ -582,7 +546,6 @@ def main(name: str, *options: str) -> None:
         use_groups(16, 3)
     if "teams" in options:
         back_ends.teams_are_faster = lambda _: True
-    name_domains()
     build_for_simulator()
     buffers_of_their_own()
     adapter = clvoro.Adapter(context, "float32" if "float32" in options else "float64")

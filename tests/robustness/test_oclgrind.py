@@ -67,88 +67,6 @@ NOT_IN = {
     "work-groups": LANES | {"conjugate_gradient.update_direction"},
 }
 """Kernels that do not exist in a variant. All others run in it."""
-ALIKE = {
-    "aggregation",
-    "conjugate_gradient",
-    "copy",
-    "gradation",
-    "multigrid",
-    "part",
-    "primitives",
-    "row_order",
-    "transfer",
-    "bins.count_in_child_bins",
-    "bins.make_grids",
-    "cells.drop_loops",
-    "poisson.apply_laplacian",
-    "poisson.apply_laplacian_full",
-    "volume_projection.project_by_group",
-}
-"""Files, and kernels of other files, that do not depend on the kind of domain. A run in one kind is enough."""
-IN_PLANE = {
-    "cells",
-    "hulls",
-    "incremental",
-    "quality_descent",
-    "vertices",
-    "insertion_deletion.average_strain",
-    "insertion_deletion.delete_merged",
-    "insertion_deletion.flag_sites",
-    "insertion_deletion.mark_bad_cells",
-    "insertion_deletion.mark_nuclei",
-    "insertion_deletion.mark_pairs",
-    "insertion_deletion.measure_strain",
-    "insertion_deletion.score_bad_cells",
-    "insertion_deletion.score_pairs",
-    "insertion_deletion.score_strain",
-    "insertion_deletion.count_pair_changes",
-}
-IN_SPACE = {"consistency", "half_faces", "polyhedra", "polyhedra_update", "walks", "surface_descent"}
-AT_POLYGONS = {"boundary_crossings", "corners", "local_counts", "thin_walls", "trim"}
-AT_LAYERS = {"metric.set_fixed_sizes", "motion.zero_fixed_displacements", "insertion_deletion.drop_fixed_sites"}
-WITH_WEIGHTS = {"power", "weight_bounds", "cells.clip_by_rings", "trim.find_outside"}
-MOVING_MESH, VOLUMES, OBTUSE = {"mmpde"}, {"transport"}, {"quality_descent.open_obtuse_triangles"}
-NOT_FOR = {
-    "plane": IN_SPACE | AT_POLYGONS | WITH_WEIGHTS | OBTUSE | {"ghost_images"},
-    "polygon": IN_SPACE | WITH_WEIGHTS | MOVING_MESH | OBTUSE | {"ghost_images", "cells.measure_faces"},
-    # Only in space do diagrams begin with the one before.
-    "torus": IN_SPACE
-    | AT_POLYGONS
-    | AT_LAYERS
-    | WITH_WEIGHTS
-    | MOVING_MESH
-    | OBTUSE
-    | {"ghost_images.unfold_rows", "ghost_images.fold_clipped_cells", "ghost_images.scale_far_measures"},
-    "sphere": IN_SPACE | AT_POLYGONS | AT_LAYERS | WITH_WEIGHTS | MOVING_MESH | VOLUMES | {"ghost_images"},
-    "space": IN_PLANE | AT_POLYGONS | AT_LAYERS | WITH_WEIGHTS | {"ghost_images"},
-    "periodic space": IN_PLANE
-    | AT_POLYGONS
-    | AT_LAYERS
-    | WITH_WEIGHTS
-    | MOVING_MESH
-    | {"ghost_images.measure_required_depths", "ghost_images.scale_far_measures", "transport.prescribe_sizes"},
-}
-"""Files and kernels that a kind of domain does not need. All others except `ALIKE` run in it, in every variant."""
-WEIGHTED = {"bins", "power", "weight_bounds"}
-ONLY_FOR = {
-    "weighted plane": WEIGHTED | {"cells", "vertices"},
-    "weighted polygon": WEIGHTED | {"cells", "vertices", "boundary_crossings", "trim"},
-    "weighted space": WEIGHTED | {"half_faces", "consistency", "polyhedra"},
-}
-"""Files that power diagrams need."""
-NOT_WEIGHTED = {
-    # Generators are not sorted, polygons have precise faces, and every part of a cell belongs to it.
-    "weighted plane": {"bins.number_items"},
-    "weighted polygon": {
-        "bins.number_items",
-        "cells.measure_faces",
-        "trim.adopt_pieces",
-        "trim.settle_pieces",
-        "trim.list_orphans",
-    },
-    "weighted space": {"bins.number_items"},
-}
-"""Kernels of these files that they do not need."""
 PATIENCE = 20
 """Seconds without a word."""
 
@@ -288,10 +206,9 @@ def test_nothing_is_found(trusted, name, variant):
 @pytest.mark.parametrize(("name", "variant"), OF_TEAMS)
 def test_nothing_is_found_of_teams(trusted, name, variant):
     text, runs = trusted.log(name, *WITH_TEAMS[variant])
-    seen = {kernel for some in runs.values() for kernel in some}
     # Only in boxes with walls do they build cells, and only runs update them.
     expected = {"solid": {NEW}, "rod-run": {UPDATED}}.get(name, TEAMS)
-    assert seen & TEAMS == expected
+    assert set(runs) & TEAMS == expected
     assert text.strip() == "", text[:3000]
 
 
@@ -310,30 +227,5 @@ def all_kernels():
 @pytest.mark.parametrize("variant", list(VARIANTS))
 def test_every_kernel_has_run(trusted, variant):
     assert len(all_kernels()) > 100
-    seen = {kernel for runs in runs_of(trusted, variant) for some in runs.values() for kernel in some}
+    seen = {kernel for name in USEFUL for kernel in trusted.log(name, *VARIANTS[variant])[1]}
     assert all_kernels() - seen == NOT_IN[variant]
-
-
-@pytest.mark.parametrize("variant", list(VARIANTS))
-@pytest.mark.parametrize("domain", [*NOT_FOR, *ONLY_FOR])
-def test_every_kernel_has_run_in_the_domain(trusted, domain, variant):
-    seen = {kernel for runs in runs_of(trusted, variant) for kernel in runs.get(domain, ())}
-    assert without(seen & all_kernels(), ALIKE) == expected_in(domain) - NOT_IN[variant]
-
-
-def expected_in(domain):
-    """Return the kernels that work in a domain needs, but for those of `ALIKE`."""
-    kernels = without(all_kernels(), ALIKE)
-    if domain in NOT_FOR:
-        return without(kernels, NOT_FOR[domain])
-    return kernels - without(kernels, ONLY_FOR[domain]) - NOT_WEIGHTED[domain]
-
-
-def runs_of(trusted, variant):
-    """Return how often which kernels ran in which domain, by each piece of work."""
-    return [trusted.log(name, *VARIANTS[variant])[1] for name in USEFUL]
-
-
-def without(kernels, named):
-    """Return those of `kernels` that neither are `named` nor of a file that is."""
-    return {k for k in kernels if k not in named and k.partition(".")[0] not in named}
