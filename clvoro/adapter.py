@@ -34,6 +34,7 @@ from .mesh.results import Result, Transported
 from .opencl import devices as device
 from .opencl.build_notice import BuildNotice, report_builds
 from .opencl.engine import Engine
+from .opencl.prebuild import renew
 from .opencl.probe import check_process
 from .tessellation.readback.diagram import make_diagram
 
@@ -190,6 +191,8 @@ class Adapter:
         engine = self._engine_for(domain)
         key = domain.dim, engine.traits.macros
         stages = self._stages.get(key)
+        if stages is not None:
+            renew(stages.engine)
         if stages is None or stages.engine.traits != engine.traits:
             # Stages of other periods are dropped. The programs are cached elsewhere and serve these, too.
             stages = self._stages[key] = Stages(engine)

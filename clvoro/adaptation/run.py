@@ -20,6 +20,7 @@ from ..mesh.diagram import Diagram
 from ..mesh.results import HISTORY_DTYPE, Displacements, Result, figures
 from ..mesh.straightening import cell_quality
 from ..mesh.subset import without_holes
+from ..opencl.prebuild import renew
 from ..opencl.primitives import Summary
 from ..sizing.field import as_field
 from ..solvers.linear_system import Solution
@@ -286,6 +287,7 @@ class Run:
             while len(self.rows) == known and not self.stop_reason:
                 self.stop_reason = self._end_reason(self.position == len(self.schedule))
                 if not self.stop_reason:
+                    renew(self._stages.engine)
                     self._acts = True
                     self.schedule[self.position].apply(self)
                     self._acts = False

@@ -5,6 +5,7 @@ work-group. So each kernel is launched once. All its numbers are zero, so that i
 """
 
 import contextlib
+import os
 import pickle
 import sys
 
@@ -22,9 +23,13 @@ def work(platform: int, device: int) -> None:
     cl.Program(ctx, "kernel void nothing(void) {}").build(["-D_OPENCL_H_"])
     flags = cl.mem_flags.READ_WRITE | cl.mem_flags.COPY_HOST_PTR
     zeros = cl.Buffer(ctx, flags, hostbuf=np.zeros(_BUFFER_BYTES, np.uint8))
-    programs, launches = pickle.load(sys.stdin.buffer)
+    programs, launches, patient = pickle.load(sys.stdin.buffer)
     built: dict[int, cl.Program] = {}
+    eager = True
     for index, name, group, sizes in launches:
+        if eager and index >= patient and hasattr(os, "nice"):
+            os.nice(10)
+            eager = False
         if index not in built:
             text, options = programs[index]
             built[index] = cl.Program(ctx, text).build(options=list(options))

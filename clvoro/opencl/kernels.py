@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import weakref
 from collections.abc import Callable, Iterable, Sequence
 from types import SimpleNamespace
 from typing import Any
@@ -55,6 +56,9 @@ class KernelPool:
         self._free: dict[tuple[int, str], list[cl.Kernel]] = {}
         self._taken: list[tuple[tuple[int, str], cl.Kernel]] = []
         self._ranges: dict[tuple[int, str], Range] = {}
+        self.users: weakref.WeakValueDictionary[int, Kernels] = weakref.WeakValueDictionary()
+        self.optimized = 0
+        """How many optimizations of programs it knows of; see `prebuild.renew`."""
         self.on_kernel: Callable[[int], object] | None = None
         """Called with the number of kernels that have been taken, when there is a new one."""
         self.on_work: Callable[[str], object] | None = None
@@ -80,6 +84,11 @@ class KernelPool:
             self._free[key].append(kernel)
         self._taken.clear()
 
+    def renew(self) -> None:
+        """Let all that hold kernels of this pool build their programs again when they next use them."""
+        for kernels in list(self.users.values()):
+            kernels.forget()
+
 
 class Kernels(SimpleNamespace):
     """The kernels of a program as attributes. The program is built when the first of them is used.
@@ -101,6 +110,7 @@ class Kernels(SimpleNamespace):
 
     def __init__(self, build: Callable[[int], cl.Program], stage: str, pool: KernelPool, group_size: int = 1) -> None:
         super().__init__(_build=build, _stage=stage, _pool=pool, _group_size=group_size)
+        pool.users[id(self)] = self
 
     def __getattr__(self, name: str) -> cl.Kernel:
         if name.startswith("_"):
@@ -114,6 +124,11 @@ class Kernels(SimpleNamespace):
         kernel.stage = self._stage.rpartition("/")[2]  # type: ignore[attr-defined]
         setattr(self, name, kernel)
         return kernel
+
+    def forget(self) -> None:
+        """Forget all kernels: they are taken again from the program that `build` then returns."""
+        for name in [name for name in vars(self) if not name.startswith("_")]:
+            delattr(self, name)
 
     def _take(self, name: str, size: int) -> cl.Kernel:
         """Return a kernel of the program for groups of `size`."""

@@ -7,6 +7,9 @@ A process builds one PoCL program or kernel at a time, whatever the number of th
 worker processes (`build_worker`) build kernels into PoCL's cache. `first_kernels.json` lists the kernels of each kind
 of run; `bench/first_run.py --record` writes it. The workers begin with the kernels that are needed last. This process
 builds those that it needs before a worker has built them.
+
+A first run takes kernels without optimization, which are built in less than half of the time and give the same bits.
+The workers then build the optimized ones, which replace them (`renew`).
 """
 
 from __future__ import annotations
@@ -27,7 +30,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 import pyopencl as cl
 
-from .program import build_in_threads, on_pocl, program_text, text_for_driver
+from . import program as _program
+from .program import UNOPTIMIZED, build_in_threads, on_pocl, program_text, text_for_driver
 from .runtimes import cache_home
 
 if TYPE_CHECKING:
@@ -43,6 +47,10 @@ _waiting: list[subprocess.Popen[bytes]] = []
 """Workers that have no work yet."""
 _known: set[tuple[str, int]] = set()
 """Kinds of runs, and devices, of this process."""
+_lock = threading.Lock()
+_under_way: list[Optimization] = []
+_optimized = 0
+"""Number of optimizations that have ended."""
 
 
 class FirstLaunch(NamedTuple):
@@ -55,10 +63,22 @@ class FirstLaunch(NamedTuple):
 
 
 class Work(NamedTuple):
-    """What a worker builds: text and options of programs, and launches in the order of building."""
+    """What a worker builds: text and options of programs, and launches in the order of building.
+
+    It builds programs from number `patient` on with a lower priority.
+    """
 
     programs: list[tuple[str, tuple[str, ...]]]
     launches: list[FirstLaunch]
+    patient: int = 0
+
+
+class Optimization(NamedTuple):
+    """Programs that `workers` optimize while this process uses them without. `marker` then says that it is done."""
+
+    programs: list[tuple[str, tuple[str, ...]]]
+    workers: list[subprocess.Popen[bytes]]
+    marker: Path
 
 
 def start_workers(device: cl.Device) -> None:
@@ -82,21 +102,48 @@ def build_ahead(engine: Engine, job: str = "") -> int:
         return 0
     _known.add((kind, device.int_ptr))
     work = _work(engine, recorded)
-    is_new = _is_new(repr(work.programs), device)
     if not in_processes:
         # Also if they are in the driver's cache: to load them takes time, too.
         build_in_threads(engine.ctx, work.programs, min(_other_cores(), MOST_THREADS))
-    if not is_new or not in_processes:
-        return len(work.launches) if is_new else 0
+        return len(work.launches) if _is_new(repr(work.programs), device) else 0
+    marker = _marker(repr(work.programs), device)
+    if marker is None or marker.exists():
+        return 0
     if not _waiting:
         _start(device)
-    texts = [text_for_driver(engine.ctx, *program) for program in work.programs]
+    if not _waiting:
+        _mark(marker)
+        return len(work.launches)
+    quick = [(text, (*options, UNOPTIMIZED)) for text, options in work.programs]
+    texts = [text_for_driver(engine.ctx, *program) for program in (*quick, *work.programs)]
     for index, worker in enumerate(_waiting):
-        mine = Work(texts, _share(work.launches, index, len(_waiting)))
+        mine = _share(work.launches, index, len(_waiting))
+        later = [launch._replace(program=launch.program + len(quick)) for launch in mine]
         # A worker reads once it has loaded the compiler, and a pipe holds less than the work.
-        threading.Thread(target=_send, args=(worker, mine), daemon=True).start()
+        sent = Work(texts, mine + later, len(quick))
+        threading.Thread(target=_send, args=(worker, sent), daemon=True).start()
+    _program.quick.update(work.programs)
+    _under_way.append(Optimization(work.programs, list(_waiting), marker))
     _waiting.clear()
-    return len(work.launches)
+    return len(work.launches) if _is_new(repr(quick), device) else 0
+
+
+def renew(engine: Engine) -> None:
+    """Let `engine` take optimized kernels if workers have built more of them."""
+    global _optimized
+    with _lock:
+        for optimization in _under_way[:]:
+            codes = [worker.poll() for worker in optimization.workers]
+            if None in codes:
+                continue
+            if not any(codes):
+                _mark(optimization.marker)
+            _program.quick.difference_update(optimization.programs)
+            _under_way.remove(optimization)
+            _optimized += 1
+    if engine.pool.optimized < _optimized:
+        engine.pool.optimized = _optimized
+        engine.pool.renew()
 
 
 def kind_of(engine: Engine, job: str = "") -> str:
@@ -138,19 +185,30 @@ def _share(launches: list[FirstLaunch], index: int, count: int) -> list[FirstLau
 
 def _is_new(what: str, device: cl.Device) -> bool:
     """Return whether the cache has no marker for `what` on `device`, and add the marker."""
+    marker = _marker(what, device)
+    return marker is not None and _mark(marker)
+
+
+def _marker(what: str, device: cl.Device) -> Path | None:
+    """Return the file that says that `what` is in the cache of `device`; None if there is no cache."""
     if on_pocl(device) and os.environ.get("POCL_KERNEL_CACHE") == "0":
-        return False
-    with contextlib.suppress(OSError, RuntimeError):
+        return None
+    try:
         folder = cache_home()
-        if on_pocl(device):
-            folder = Path(os.environ.get("POCL_CACHE_DIR") or folder / "pocl" / "kcache")
-        version = device.version, device.driver_version, device.name, what
-        name = hashlib.sha256(repr(version).encode()).hexdigest()[:16]
-        marker = folder / "clvoro" / name
+    except (OSError, RuntimeError):
+        return None
+    if on_pocl(device):
+        folder = Path(os.environ.get("POCL_CACHE_DIR") or folder / "pocl" / "kcache")
+    version = device.version, device.driver_version, device.name, what
+    return folder / "clvoro" / hashlib.sha256(repr(version).encode()).hexdigest()[:16]
+
+
+def _mark(marker: Path) -> bool:
+    """Make the file `marker`; return whether it has not been there."""
+    with contextlib.suppress(OSError):
         marker.parent.mkdir(parents=True, exist_ok=True)
-        with contextlib.suppress(FileExistsError):
-            marker.open("x").close()
-            return True
+        marker.open("x").close()
+        return True
     return False
 
 
@@ -193,12 +251,15 @@ def _send(worker: subprocess.Popen[bytes], work: Work) -> None:
     """Send `worker` its work, unless it has ended."""
     assert worker.stdin is not None
     with contextlib.suppress(OSError, ValueError):
-        pickle.dump((work.programs, [tuple(launch) for launch in work.launches]), worker.stdin)
+        pickle.dump((work.programs, [tuple(launch) for launch in work.launches], work.patient), worker.stdin)
         worker.stdin.close()
 
 
 def _stop_workers() -> None:
-    """End the workers."""
+    """End the workers. What they have not built the next process builds."""
+    for optimization in _under_way:
+        if all(worker.poll() == 0 for worker in optimization.workers):
+            _mark(optimization.marker)
     for worker in _workers:
         if worker.poll() is None:
             worker.kill()

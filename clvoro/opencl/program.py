@@ -30,11 +30,14 @@ _building = 0.0
 _threads: list[threading.Thread] = []
 _ending = threading.Event()
 _silent = 0
+quick: set[tuple[str, tuple[str, ...]]] = set()
+"""Programs, as text and options, that are built without optimization as long as they are here; see `prebuild`."""
 _IGNORED = ("ignore", None, cl.CompilerWarning, None, 0)
 NO_ABI_WARNINGS = '#pragma clang diagnostic ignored "-Wpsabi"\n'
 """Put before programs for PoCL. On a CPU without AVX-512 clang warns that other compilers pass vectors of eight doubles
 in another way. That does not matter, because kernels call no code of other compilers."""
 ROUNDED_QUOTIENTS = "-cl-fp32-correctly-rounded-divide-sqrt"
+UNOPTIMIZED = "-cl-opt-disable"
 STATIC_FUNCTIONS = "#define inline static inline\n"
 """Put before programs; see `needs_static_functions`."""
 POCL = "Portable Computing Language"
@@ -87,6 +90,8 @@ def build_program(ctx: cl.Context, name: str, defines: Mapping[str, object], pre
 def _build_once(ctx: cl.Context, text: str, options: tuple[str, ...]) -> cl.Program:
     """Build a program, or wait for the thread that builds it. Whoever comes first builds it."""
     global _building
+    if (text, options) in quick:
+        options = (*options, UNOPTIMIZED)
     key = (ctx.int_ptr, text, options)
     began = time.perf_counter()
     with _lock:

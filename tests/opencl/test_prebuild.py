@@ -19,7 +19,7 @@ from clvoro.opencl import build_notice, prebuild, program
 from clvoro.opencl import engine as engines
 from clvoro.opencl.build_notice import BuildNotice, report_builds
 from clvoro.opencl.engine import Engine
-from clvoro.opencl.program import POCL
+from clvoro.opencl.program import POCL, UNOPTIMIZED
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "bench"))
 import first_run
@@ -80,12 +80,14 @@ def test_workers_build_recorded_kernels_once(engine, tmp_path):
     assert built >= ({"gather_rows", "scan_blocks"} if workers else set())
 
 
-def test_workers_build_what_this_process_will_need(engine, monkeypatch):
+def test_workers_build_what_this_process_will_need(engine, tmp_path, monkeypatch):
     """The text is the key of PoCL's cache. With another, all kernels would be built twice."""
     sent, texts, plain = queue.Queue(), [], cl.Program
-    monkeypatch.setattr(prebuild, "_is_new", lambda *_: True)
+    monkeypatch.setattr(prebuild, "_marker", lambda *_: tmp_path / "marker")
     monkeypatch.setattr(prebuild, "_known", set())
+    monkeypatch.setattr(prebuild, "_under_way", [])
     monkeypatch.setattr(prebuild, "_waiting", ["a worker"])
+    monkeypatch.setattr(program, "quick", set())
     monkeypatch.setattr(prebuild, "_send", lambda _, work: sent.put(work))
     assert prebuild.build_ahead(engine) > 20
     work = sent.get(timeout=30)
@@ -93,6 +95,37 @@ def test_workers_build_what_this_process_will_need(engine, monkeypatch):
     monkeypatch.setattr(program.cl, "Program", lambda ctx, text: texts.append(text) or plain(ctx, text))
     assert engine.kernels("opencl/primitives").gather_rows
     assert texts[0] in [text for text, _ in work.programs]
+    assert [UNOPTIMIZED in options for _, options in work.programs[:: work.patient]] == [True, False]
+
+
+class Worker:
+    """A process that has not ended yet, or with `code`."""
+
+    code = None
+
+    def poll(self):
+        return self.code
+
+
+@pytest.mark.parametrize("code", [0, 1])
+def test_optimized_kernels_replace_the_first_ones(engine, tmp_path, monkeypatch, code):
+    """Also if a worker fails; then the next process begins again."""
+    worker, marker, texts, plain = Worker(), tmp_path / "folder" / "marker", [], cl.Program.build
+    mine = [program.program_text("opencl/primitives.cl", engine.all_defines("opencl/primitives", {}), "")]
+    monkeypatch.setattr(program, "_programs", {})
+    monkeypatch.setattr(program, "quick", set(mine))
+    monkeypatch.setattr(prebuild, "_under_way", [prebuild.Optimization(mine, [worker], marker)])
+    monkeypatch.setattr(cl.Program, "build", lambda p, options: texts.append(options) or plain(p, options))
+    kernels, engine.pool.optimized = engine.kernels("opencl/primitives"), prebuild._optimized
+    first = kernels.gather_rows
+    prebuild.renew(engine)
+    assert kernels.gather_rows is first
+    worker.code = code
+    prebuild.renew(engine)
+    assert kernels.gather_rows is not first
+    assert [UNOPTIMIZED in options for options in texts] == [True, False]
+    assert marker.exists() == (code == 0)
+    assert not program.quick
 
 
 def test_workers_share_whole_programs_last_ones_first():
