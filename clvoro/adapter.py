@@ -199,16 +199,16 @@ class Adapter:
         return stages
 
     def diagram(self, domain: Domain, points: ArrayLike) -> Diagram:
-        """Return the Voronoi diagram of `points` in `domain`.
+        """Return the Voronoi diagram of `points` in `domain`; also `clvoro.voronoi`.
 
         To have target sizes beside it, take no step from the points:
-        ``run(domain, size, points=points, method="lloyd", max_steps=0)``.
+        ``clvoro.adapt(domain, size, points=points, method="lloyd", max_steps=0)``.
 
         Parameters
         ----------
         domain : Box, Polygon, Sphere or Solid
         points : (n, d) array of float
-            Distinct generators inside the domain, walls included.
+            Distinct generators inside the domain, walls included, in the domain's unit of length.
 
         Returns
         -------
@@ -217,15 +217,17 @@ class Adapter:
 
         Raises
         ------
-        InputError
+        DeviceError
+            If no device works.
+        InputError, InputTypeError
             If the points are not as expected, or too close together for the precision.
         MemoryLimitError
             If the device has not enough memory.
 
         Examples
         --------
-        >>> points = np.array([(0.2, 0.3), (0.7, 0.2), (0.8, 0.8)])
-        >>> clvoro.Adapter().diagram(clvoro.Box((0, 0), (1, 1)), points).volumes.round(3).tolist()
+        >>> points = [(0.2, 0.3), (0.7, 0.2), (0.8, 0.8)]
+        >>> clvoro.voronoi(clvoro.Box((0, 0), (1, 1)), points).volumes.round(3).tolist()
         [0.391, 0.275, 0.334]
         """
         with self._alone():
@@ -240,7 +242,52 @@ class Adapter:
             return make_diagram(stages, domain, host)
 
     def power_diagram(self, domain: Domain, points: ArrayLike, weights: ArrayLike) -> Diagram:
-        """Return the power diagram of `points` with `weights`, not in a Solid; see `clvoro.power_diagram`."""
+        """Return the power diagram (Laguerre diagram) of `points` with `weights`; also `clvoro.power_diagram`.
+
+        The cell of generator i is the set of y with ``|y - x_i|^2 - w_i <= |y - x_j|^2 - w_j`` for all j (Aurenhammer
+        1987, SIAM J. Comput. 16, 78). Its faces are at right angles to the lines between generators, and a larger
+        weight makes the cell larger. It need not contain its generator, and may be empty. Equal weights give the
+        Voronoi diagram. In a polygon a cell is the whole part of the domain that the definition gives it: on both sides
+        of a wall thinner than a cell, if need be, where `voronoi` gives the part without the generator to a neighbor.
+        On a sphere of radius R it is the set of y with ``exp(w_i / 2R^2) x_i.y >= exp(w_j / 2R^2) x_j.y`` for all j,
+        which is the same for cells that are small; faces are arcs of great circles (Sugihara 2002, J. Geom. Graph. 6,
+        69).
+
+        Parameters
+        ----------
+        domain : Box, Polygon or Sphere
+        points : (n, d) array of float
+            Distinct generators inside the domain.
+        weights : (n,) array of float
+            In the square of the domain's unit of length. Only their differences count.
+
+        Returns
+        -------
+        Diagram
+            Row i belongs to ``points[i]``. It has `weights`; its `empty_cells` are the rows of cells without volume.
+
+        Raises
+        ------
+        DeviceError
+            If no device works.
+        InputError, InputTypeError
+            If an argument is not as expected, the domain is a solid or has holes, or points are too close together for
+            the precision.
+        MemoryLimitError
+            If the device has not enough memory.
+
+        Warns
+        -----
+        EmptyCellsWarning
+            If cells are empty; says how many.
+
+        Examples
+        --------
+        >>> points = [(0.5, 0.5), (1.5, 0.5)]
+        >>> d = clvoro.power_diagram(clvoro.Box((0, 0), (2, 1)), points, [0.2, 0])
+        >>> d.volumes.round(3).tolist(), d.empty_cells.tolist()
+        ([1.1, 0.9], [])
+        """
         with self._alone():
             return power_diagram_of(self._stages_for(domain), domain, points, weights)
 
@@ -254,7 +301,53 @@ class Adapter:
         max_steps: int = 100,
         relax: int = 0,
     ) -> Transported:
-        """Return the power diagram of `points` whose cells have `volumes`, not in a Solid; see `clvoro.transport`."""
+        """Find the weights with which the cells of a power diagram have prescribed `volumes`; also `clvoro.transport`.
+
+        These cells transport the volume of the domain to the generators at the least cost, the integral of the squared
+        distance. Damped steps of Newton's method find them for any volumes that sum to that of the domain (Kitagawa,
+        Merigot and Thibert 2019, J. Eur. Math. Soc. 21, 2603). On a sphere the cost is -log of the cosine of the angle:
+        a cell lies within 90 degrees of its generator, so that areas that are very different from those of the Voronoi
+        cells may have no solution.
+
+        Parameters
+        ----------
+        domain : Box, Polygon or Sphere
+        points : (n, d) array of float
+            Distinct generators inside the domain. They stay where they are, without `relax`.
+        volumes : (n,) array of float
+            Volumes > 0 of the cells (areas in 2D). Their sum is that of the domain, in each of its pieces.
+        tolerance : float, optional
+            Largest relative error of a volume; by default 1e-10, in float32 1e-3.
+        max_steps : int
+            Largest number of Newton steps.
+        relax : int
+            How often generators move to the centroids of their cells, which have `volumes` to 1 % then, before the last
+            transport. Cells become round, as the grains of a polycrystal. ``diagram.points`` are the generators at the
+            end.
+
+        Returns
+        -------
+        Transported
+
+        Raises
+        ------
+        DeviceError, InputError, InputTypeError, MemoryLimitError
+            As `power_diagram`; also if the volumes do not have the sum of the domain.
+        SolverError
+            If a linear solve breaks down.
+
+        Warns
+        -----
+        SizeErrorWarning
+            If some volumes are farther off than the tolerance at the end; says how many.
+
+        Examples
+        --------
+        >>> points = [(0.2, 0.3), (0.7, 0.2), (0.8, 0.8)]
+        >>> found = clvoro.transport(clvoro.Box((0, 0), (1, 1)), points, [0.2, 0.3, 0.5])
+        >>> found.diagram.volumes.round(9).tolist(), found.converged
+        ([0.2, 0.3, 0.5], True)
+        """
         check_integer("relax", relax, 0, 10**6)
         with self._alone():
             stages = self._stages_for(domain)
@@ -283,13 +376,46 @@ class Adapter:
         callback: Callable[[np.void], object] | None = None,
         on_interrupt: Literal["raise", "return"] = "raise",
     ) -> Result:
-        """Adapt generators until their cells have the target size and a good shape, as `clvoro.adapt` does.
+        """Mesh `domain` by Voronoi cells of the target size.
+
+        `clvoro.adapt` is this method of one adapter that all calls share, on the best device, in float64 where a device
+        has it. Calls from several threads wait for each other. For a device or a precision of your own use
+        ``clvoro.Adapter(ctx, dtype).run(...)``.
 
         Parameters
         ----------
         domain : Box, Polygon, Sphere or Solid
-        size, effort, points, method, n_cells, layers, fixed, seed, callback
-            As those of `clvoro.adapt`.
+            "transport" needs a box, a polygon or a sphere, a moving mesh a box without periodic sides.
+        size : number, callable or clvoro.sizing field
+            Target size h(x) > 0, in the domain's unit of length: a cell of the right size has volume h^d. A callable
+            takes points (n, d), returns (n,), and is evaluated on the host: each step then moves all points there and
+            back.
+        effort : "fast", "default" or "best"
+            Amount of work of "adaptive", "exact" and "transport".
+        points : (n, d) array of float, "density" or "uniform"
+            Generators to start from: those of the array, random ones with density h^-d, or uniform random ones as in
+            the paper. From an array, "adaptive" and "exact" only correct and polish a mesh that nearly has the sizes
+            already (mean |e| up to 0.15, count off by 2 % at most, cells as good as after a run with this effort), as
+            after the size field has moved by a few cells. From any other array they run all levels.
+        method : str
+            "adaptive" goes from coarse to fine, inserts and deletes generators, and ends with good cells of the right
+            size. "exact" gives every cell its target size, to about 1e-4; "transport" to 1e-10 (float32: 1e-3), in a
+            power diagram, not in solids. The others repeat one kind of step: "lloyd", "poisson" and
+            "coupled" as published, "weighted-lloyd" and "weighted" with the density h^-d, and the moving meshes "mmpde"
+            and "monge-ampere", which map a lattice in a box (see `clvoro.adaptation.methods`).
+        n_cells : int, optional
+            Number of generators; by default the integral of h^-d over the domain. "adaptive", "exact" and "transport"
+            end with exactly that many. They scale the size field by a common factor so that the mean of log(L / h)
+            vanishes, and report it as ``Result.size_factor``; "transport" always does.
+        layers : Layers or sequence of Layers
+            Rows of generators along walls of a box in 2D or a polygon. They do not move and are the first rows of the
+            result. Beyond them the sizes grow gradually from the size of the layers; see `Layers`. Their cells count as
+            having the right size.
+        fixed : (k, d) array of float, optional
+            Generators that do not move, such as wells: rows 0 to k - 1 of the result, exactly at these positions. Their
+            neighbors move until all have their sizes. Not for "transport" and moving meshes, which move all of them.
+        seed : int
+            Seed of the random start.
         max_steps : int, optional
             Largest number of steps, over all levels. By default 100, or all steps of the schedule of "adaptive",
             "exact" and "transport".
@@ -298,6 +424,9 @@ class Adapter:
         checkpoint : path or Checkpoint, optional
             File to which the state of the run is written once per minute. `Checkpoint` chooses the interval, and
             continues a run.
+        callback : callable, optional
+            Called with each new row of the history (fields as in `Result.history`: ``row["mean_error"]``, ...). The
+            run stops if it returns True.
         on_interrupt : "raise" or "return"
             What Ctrl-C does: raise `Interrupted`, which carries the result so far, or return that result.
 
@@ -307,14 +436,45 @@ class Adapter:
 
         Raises
         ------
-        InputError, InputTypeError, SizeFieldError, MemoryLimitError, SolverError, Interrupted
-            As `clvoro.adapt`; also if the checkpoint is damaged or belongs to another run.
+        DeviceError
+            If no device works.
+        InputError, InputTypeError
+            If an argument is not as expected, or a generator of `fixed` is outside, on a wall, within a layer, or at
+            the place of another one; says where. Also if the checkpoint is damaged or belongs to another run.
+        SizeFieldError
+            If h is not positive and finite somewhere; names the place.
+        MemoryLimitError
+            If the run needs more memory than the device has.
+        SolverError
+            If a linear solve breaks down.
+        Interrupted
+            On Ctrl-C: a `KeyboardInterrupt` with the result so far.
 
         Warns
         -----
         CheckpointWarning
             If a checkpoint cannot be written, for example on a full disk. The run continues, and the previous
-            checkpoint is kept. Other warnings are those of `clvoro.adapt`.
+            checkpoint is kept.
+        MismatchWarning, CoarseSizeWarning
+            If a part of the input barely overlaps the domain, for example because it has another unit of length, or the
+            domain is narrower than half a cell somewhere, or has a dead end narrower than a cell, or a generator of
+            `fixed` is near a wall or another one for the size there; says where.
+        ObtuseTrianglesWarning
+            If obtuse triangles are left in a mesh on a sphere that "adaptive" or "exact" has finished.
+        PrecisionWarning
+            If the precision of the device is too coarse for the sizes.
+        SizeErrorWarning
+            If the cells of a mesh that "adaptive" or "exact" has finished are far from their target sizes.
+        TangledMeshWarning
+            If a moving mesh would fold; says at how many generators.
+        UnusedOptionWarning
+            If an argument is given that the method does not use.
+
+        Examples
+        --------
+        >>> mesh = clvoro.adapt(clvoro.Box((0, 0), (2, 1)), lambda p: 0.05 + 0.1 * p[:, 0], "fast")
+        >>> bool(abs(mesh.diagram.volumes.sum() - 2) < 1e-12), bool(abs(mesh.size_error).mean() < 0.05)
+        (True, True)
         """
         given = {"effort": effort, "seed": seed, "max_steps": max_steps, "n_cells": n_cells, "layers": layers}
         merged, own = merged_options(points, options, method=method, **given)
