@@ -814,12 +814,8 @@ ROWS = [
         lambda t: t.without("meshio").mesh.save(t.path("a.vtu")),
     ),
     (
-        lambda t: t.without("xarray").case(SPHERE_CASE.replace("0.7\n", LONLAT.format(t.hdf))),
-        lambda t: t.without("xarray").case(SPHERE_CASE.replace("0.7\n", LONLAT.format(t.classic))),
-    ),
-    (
-        lambda t: t.needs("xarray", "netCDF4").case(SPHERE_CASE.replace("0.7\n", LONLAT.format(t.hdf))),
-        lambda t: t.case(SPHERE_CASE.replace("0.7\n", LONLAT.format(t.classic))),
+        lambda t: t.without("netCDF4").case(SPHERE_CASE.replace("0.7\n", LONLAT.format(t.hdf))),
+        lambda t: t.without("netCDF4").case(SPHERE_CASE.replace("0.7\n", LONLAT.format(t.classic))),
     ),
     (
         lambda t: t.full_disk("full").mesh.save(t.path("full/a.npz")),
@@ -1019,12 +1015,7 @@ TESTED_IN = {
 """Parts of texts of errors without a row, and the tests that raise them."""
 
 
-LIBRARIES = {
-    "cannot be read as STEP": "gmsh",
-    "holds no solid": "gmsh",
-    "is it damaged? Else": "xarray",
-    "borders on its own periodic image": "fipy",
-}
+LIBRARIES = {"cannot be read as STEP": "gmsh", "holds no solid": "gmsh", "borders on its own periodic image": "fipy"}
 """Parts of texts of errors, and the library that their rows need."""
 
 

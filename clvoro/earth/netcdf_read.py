@@ -190,6 +190,10 @@ class Variables:
         """Return the names of the dimensions of a variable."""
         return tuple(self._file.variables[name].dimensions)
 
+    def shape(self, name: str) -> tuple[int, ...]:
+        """Return the lengths of the dimensions of a variable."""
+        return tuple(self._file.variables[name].shape)
+
     def kind(self, name: str) -> str:
         """Return the kind of a variable's type, as of `numpy.dtype`."""
         found = self._file.variables[name]
@@ -361,10 +365,12 @@ _HDF5 = b"\x89HDF"
 
 @contextmanager
 def open_netcdf(path: str | PathLike[str]) -> Iterator[Variables]:
-    """Open a netCDF file of either version."""
+    """Open a netCDF file of either version: the one way to read them, for meshes, fields and grids."""
     with open_plain(path) as file:
         head = file.read(4)
         file.seek(0)
+        if not head.startswith((b"CDF", _HDF5)):
+            raise FileError("it is another kind of file, expected a netCDF file")
         with _netcdf4(os.fspath(path)) if head == _HDF5 else scipy.io.netcdf_file(file, mmap=False) as found:
             yield Variables(found)
 

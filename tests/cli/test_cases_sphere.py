@@ -174,11 +174,17 @@ def test_mistakes_in_sizes(tmp_path, text, message):
         sizes(f"[size]\n{text}", tmp_path)
 
 
-def test_files_of_netcdf_4_need_xarray(tmp_path, monkeypatch):
-    monkeypatch.setitem(__import__("sys").modules, "xarray", None)
-    (tmp_path / "h.nc").write_bytes(b"\x89HDF\r\n\x1a\n" + bytes(100))
-    with pytest.raises(InputError, match="pip install xarray"):
-        sizes(RASTER.format("h.nc"), tmp_path)
+def test_grids_of_xarray(tmp_path):
+    """netCDF-4, with packed values and a gap; longitudes from -180."""
+    xarray, _ = pytest.importorskip("xarray"), pytest.importorskip("netCDF4")
+    coords = {"latitude": LAT, "longitude": (LON + 180) % 360 - 180}
+    data = xarray.DataArray(WAVES, coords, ("latitude", "longitude"), name="h").sortby("longitude")
+    packing = {"dtype": "i2", "scale_factor": 0.01, "add_offset": 100.0, "_FillValue": -32768}
+    data.where(data.latitude < 80).to_netcdf(tmp_path / "h.nc", encoding={"h": packing})
+    found = sizes(RASTER.format("h.nc") + "variable = 'h'\nmissing = 'nearest'", tmp_path)
+    wanted, south = on_domain(SPHERE, sizing.Raster(WAVES[::-1], (0, -90), (350, 90)))(X), X[:, 2] < 900
+    assert found[south] == pytest.approx(wanted[south], abs=20 * np.radians(10))
+    assert np.median(np.abs(found - wanted)) < 0.005
 
 
 @pytest.mark.parametrize(

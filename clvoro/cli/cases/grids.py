@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import scipy
 
-from ...earth.netcdf_read import NETCDF_SUFFIXES
+from ...earth.netcdf_read import NETCDF_SUFFIXES, Variables, open_netcdf
 from ...errors import InputError
-from ...files import open_plain
 from ...io.arrays import FileError, array_names, explained, read_array
 
 _LONGITUDES, _LATITUDES = ("lon", "longitude"), ("lat", "latitude")
@@ -84,69 +81,20 @@ def _from_npz(path: Path, variable: str | None) -> Labeled | None:
     return Labeled(name, arrays[name], (lat, lon), coords=coords)
 
 
-def _from_netcdf(path: Path, variable: str | None) -> Any:
-    with explained(path, "a netCDF file"), open_plain(path) as file:
-        start = file.read(4)
-        if start[:3] == b"CDF":
-            file.seek(0)
-            return _from_classic(file, path, variable)
-        if start != b"\x89HDF":
-            raise FileError("it is another kind of file, expected a netCDF file")
-    return _by_xarray(path, variable)
+def _from_netcdf(path: Path, variable: str | None) -> Labeled:
+    with explained(path, "a netCDF file"), open_netcdf(path) as file:
+        known = {key: file.dimensions(key) for key in file.names() if file.kind(key) in "iuf"}
 
+        def lengths(name: str) -> list[int]:
+            return [n for n, dim in zip(file.shape(name), known[name], strict=True) if dim in known]
 
-def _from_classic(file: Any, path: Path, variable: str | None) -> Labeled:
-    """Read netCDF-3."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        with scipy.io.netcdf_file(file, "r", mmap=False, maskandscale=True) as held:
-            known = held.variables
-
-            def lengths(item: Any) -> list[int]:
-                return [n for n, dim in zip(item.shape, item.dimensions, strict=True) if dim in known]
-
-            name = _choose(variable, _data_variables(held), lengths)
-            own = held.variables[name]
-            along = set(own.dimensions)
-            wanted = [key for key, v in held.variables.items() if set(v.dimensions) <= along]
-            parts = {key: _labeled(key, held.variables[key]) for key in {*wanted, name}}
+        name = _choose(variable, {key: key for key, dims in known.items() if dims != (key,)}, lengths)
+        along = set(known[name])
+        parts = {key: _labeled(file, key) for key, dims in known.items() if set(dims) <= along or key == name}
     found = parts.pop(name)
     return Labeled(name, found.values, found.dims, found.attrs, parts)
 
 
-def _data_variables(held: Any) -> dict[str, Any]:
-    """Return the variables that are no coordinates."""
-    return {name: v for name, v in held.variables.items() if name not in held.dimensions}
-
-
-def _labeled(name: str, found: Any) -> Labeled:
-    attrs = {
-        key: value.decode("utf-8", "replace") if isinstance(value, bytes) else value
-        for key, value in found._attributes.items()
-    }
-    values = found[...]
-    native = values.astype(values.dtype.newbyteorder("="))
-    return Labeled(name, native, tuple(found.dimensions), attrs)
-
-
-def _by_xarray(path: Path, variable: str | None) -> Any:
-    """Read netCDF-4, which is HDF5."""
-    remedy = "pip install xarray netCDF4, or convert the file to netCDF-3, as by nccopy -k nc6 IN OUT"
-    try:
-        import xarray  # type: ignore[import-not-found]
-    except ModuleNotFoundError as error:
-        raise InputError(
-            f"{path} is a netCDF-4 file, which needs xarray, and that is not installed; {remedy}"
-        ) from error
-    try:
-        with xarray.open_dataset(path) as held:
-            return held[_choose(variable, held.data_vars, _gridded)].load()
-    except FileError as problem:
-        raise InputError(f"cannot load {path}: {problem}") from problem
-    except Exception as error:  # of any of the libraries that xarray reads files with
-        raise InputError(f"cannot load {path}: xarray says {error!s:.300}; is it damaged? Else {remedy}") from error
-
-
-def _gridded(array: Any) -> list[int]:
-    """Return the lengths of the dimensions of a DataArray that have coordinates."""
-    return [array.sizes[name] for name in array.dims if name in array.coords]
+def _labeled(file: Variables, name: str) -> Labeled:
+    attrs = {key: file.about(name, key) or "" for key in ("standard_name", "units")}
+    return Labeled(name, file.data(name), file.dimensions(name), attrs)
