@@ -22,7 +22,7 @@ from .adaptation.options import (
     merged_options,
 )
 from .adaptation.preparation import prepare
-from .adaptation.run import Run, check_run
+from .adaptation.run import Run, check_run, check_shared
 from .adaptation.stages import Stages
 from .adaptation.transport import RELAXED, power_diagram_of, transport_to
 from .arguments import check_choice, check_integer, check_points, coincident_named
@@ -34,6 +34,7 @@ from .mesh.results import Result, Transported
 from .opencl import devices as device
 from .opencl.build_notice import BuildNotice, report_builds
 from .opencl.engine import Engine
+from .opencl.peers import ALONE, Peers, Ranks
 from .opencl.prebuild import renew
 from .opencl.probe import check_process
 from .tessellation.readback.diagram import make_diagram
@@ -55,6 +56,10 @@ class Adapter:
         Any context; by default that of `clvoro.create_context()`.
     dtype : "float64" or "float32"
         Precision on the device.
+    comm : mpi4py.MPI.Comm, optional
+        Share runs among the ranks of this communicator: all of them create an adapter and call `run` with the same
+        arguments. Each gets a `Result` of its own cells, and ``result.gather()`` returns the whole mesh on rank 0. In
+        boxes with walls, with the methods that neither transport nor map.
 
     Attributes
     ----------
@@ -85,7 +90,10 @@ class Adapter:
     """
 
     def __init__(
-        self, ctx: cl.Context | None = None, dtype: Literal["float64", "float32"] | DTypeLike = "float64"
+        self,
+        ctx: cl.Context | None = None,
+        dtype: Literal["float64", "float32"] | DTypeLike = "float64",
+        comm: object = None,
     ) -> None:
         try:
             real = np.dtype(dtype)  # type: ignore[arg-type]
@@ -104,7 +112,8 @@ class Adapter:
         if real == np.float64:
             device.require_fp64(self.ctx)
         self.queue = cl.CommandQueue(self.ctx)
-        self._stages: dict[tuple[int, tuple[str, ...]], Stages] = {}
+        self._peers = ALONE if comm is None else Ranks(comm)
+        self._stages: dict[tuple[int, tuple[str, ...], bool], Stages] = {}
         self._busy = threading.Lock()
         self._owner: int | None = None
         self._watch: Callable[[np.void], None] | None = None
@@ -172,7 +181,7 @@ class Adapter:
 
         return all_of_them
 
-    def _engine_for(self, domain: Domain) -> Engine:
+    def _engine_for(self, domain: Domain, peers: Peers = ALONE) -> Engine:
         if not isinstance(domain, Domain):
             hint = ""
             if type(domain).__module__.startswith("shapely"):
@@ -185,11 +194,11 @@ class Adapter:
                 f"domain is a {type(domain).__name__}, expected a clvoro.Box, clvoro.Polygon, clvoro.Sphere or "
                 f"clvoro.Solid{hint}"
             )
-        return Engine(self.ctx, self.queue, domain.dim, self.dtype, domain.traits(self.dtype))
+        return Engine(self.ctx, self.queue, domain.dim, self.dtype, domain.traits(self.dtype), peers=peers)
 
-    def _stages_for(self, domain: Domain) -> Stages:
-        engine = self._engine_for(domain)
-        key = domain.dim, engine.traits.macros
+    def _stages_for(self, domain: Domain, peers: Peers = ALONE) -> Stages:
+        engine = self._engine_for(domain, peers)
+        key = domain.dim, engine.traits.macros, peers.shared
         stages = self._stages.get(key)
         if stages is not None:
             renew(stages.engine)
@@ -483,13 +492,18 @@ class Adapter:
         with self._alone():
             for kept in self._stages.values():
                 kept.release()  # buffers of a diagram, or of a failed run, are not part of this run's memory
-            stages = self._stages_for(domain)
+            stages = self._stages_for(domain, self._peers)
+            if self._peers.shared:
+                check_shared(domain, merged, fixed, checkpoint)
             with report_builds(stages.engine, self.on_build) as notice:
                 shown = self._shown(callback, notice)
-                run = Run(stages, domain, size, own, fixed, merged, checkpoint, shown, self.on_memory)
                 stages.engine.pool.on_work = self.on_work
                 try:
+                    run = Run(stages, domain, size, own, fixed, merged, checkpoint, shown, self.on_memory)
                     return run.conclude(on_interrupt)
+                except BaseException as error:
+                    self._peers.fail(error)
+                    raise
                 finally:
                     stages.engine.pool.on_work = None
 

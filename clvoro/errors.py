@@ -48,6 +48,10 @@ class SolverError(ClvoroError, ArithmeticError):
     """A linear solve broke down (not positive definite, or not finite)."""
 
 
+class RankError(ClvoroError, RuntimeError):
+    """Another rank of the run has failed; the message has its error."""
+
+
 class Interrupted(KeyboardInterrupt):
     """Ctrl-C during a run. It carries the mesh so far, of the size and the number of cells that were requested.
 

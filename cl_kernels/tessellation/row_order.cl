@@ -3,7 +3,9 @@
    the same bits.
 
    In 2D a row, which runs counter-clockwise, begins with the least label. In 3D labels ascend; vertices are triples of
-   faces that begin with the least one, in ascending order. Walls come first. One work-item per generator. */
+   faces that begin with the least one, in ascending order. Walls come first. One work-item per generator.
+
+   reach[i] is the distance of the farthest corner of cell i from its generator, or a bound of it. */
 #define FIRST_OF(i, j, points) first_in_space(i, j, points)
 #include "geometry/site.h"
 #include "tessellation/report.h"
@@ -29,7 +31,7 @@ inline int label_of(int row, global const int *labels)
 kernel void order_rows(const int size, global const int *starts, global int *neighbors, global const int *labels,
                        global const REAL *points, const REAL4 box_lower, const REAL4 box_upper,
                        global FACE *face_measures, global FACE *face_centroids, global REAL *volumes,
-                       global REAL *offsets, global REAL *covariances)
+                       global REAL *offsets, global REAL *covariances, global float *reach)
 {
     LONG_ITEM(i);
     const REAL lower[2] = {box_lower.s0, box_lower.s1};
@@ -42,6 +44,13 @@ kernel void order_rows(const int size, global const int *starts, global int *nei
     for (int k = 0; k < n; ++k)
         faces[k] = neighbors[begin + (first + k < n ? first + k : first + k - n)];
     measure_cell(&to, i, faces, n, points, lower, upper);
+    SITE(x, i, points);
+    REAL far2 = 0;
+    for (int k = 0; k < n; ++k) {
+        const REAL2 v = corner(i, x, faces[k], faces[k + 1 < n ? k + 1 : 0], points, lower, upper);
+        far2 = fmax(far2, dot(v, v));
+    }
+    reach[i] = (float)sqrt(far2);
 }
 #else
 #include "tessellation/update_rows.h"
@@ -62,9 +71,15 @@ inline int triple_of(int a, int b, int c)
 kernel void order_rows(const int size, global const int *starts, global int *neighbors, global const int *labels,
                        global const REAL *points, CLIP_BOX_ARGS, global uchar4 *corners, global REAL *face_measures,
                        global REAL *face_centroids, global REAL *volumes, global REAL *offsets,
-                       global REAL *covariances PERIOD_ARGS)
+                       global REAL *covariances, global float *reach PERIOD_ARGS)
 {
     LONG_ITEM(i);
+    /* No corner of a convex body is farther from its centroid than sqrt(d (d + 2)) standard deviations. */
+    REAL offset2 = 0;
+    EACH_AXIS (a)
+        offset2 += offsets[3 * i + a] * offsets[3 * i + a];
+    reach[i] =
+        (float)(sqrt(offset2) + sqrt(15 * (covariances[6 * i] + covariances[6 * i + 3] + covariances[6 * i + 5])));
     const int begin = starts[i], n = starts[i + 1] - begin;
     const int state = n > MOST_FACES ? NO_CORNERS : corners[2 * begin].s3;
     if (state == NO_CORNERS)
@@ -95,12 +110,15 @@ kernel void order_rows(const int size, global const int *starts, global int *nei
     }
     for (int v = 0; v < cell.corners; ++v)
         cell.at[v] = (uchar4)(triples[v] >> 16, triples[v] >> 8 & 255, triples[v] & 255, 0);
-    const bool clear = place_corners(&cell, &sums, true) && fits_corners(&cell) && state != UNSURE_CORNERS;
+    const bool fits = place_corners(&cell, &sums, true) && fits_corners(&cell);
+    const bool clear = fits && state != UNSURE_CORNERS;
     REAL volume = 0;
     for (int f = 0; f < n; ++f)
         volume += cell.planes[f].s3 * sums.faces[f].s0 / 24;
     if (!(fabs(volume - volumes[i]) <= ALIKE * volumes[i]))
         return;
+    if (fits)
+        reach[i] = (float)sqrt(cell.reach2);
     const measured_t out = {neighbors, face_measures, face_centroids, volumes, offsets, covariances};
     write_measures(&cell, &sums, i, begin, &out);
     write_triples(&cell, corners + 2 * begin, clear ? NEW_CORNERS : NO_CORNERS);

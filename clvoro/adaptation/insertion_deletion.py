@@ -270,7 +270,7 @@ class InsertionDeletion:
 
     def _count(self, t: Tessellation) -> int:
         """Return the number of generators of all parts."""
-        return int(t.total(np.array(t.n)))
+        return int(self.engine.peers.total(t.n))
 
     def _nucleate(self, t: Tessellation, kinds: cla.Array, strain: cla.Array, marks: _Marks, nuclei: int) -> None:
         """Mark at most `nuclei` insertions and as many mergers where the perfect lattice is strained most."""
@@ -283,7 +283,8 @@ class InsertionDeletion:
         ranks = self._room("ranks", size=n + 1, dtype=np.int32)
         engine.run_each(k.flag_sites, n, chosen, ranks)
         self._scan.exclusive(ranks, ranks, n)
-        first = 0 if t.part is None else int(t.part.before(ranks[n:].get())[0])
+        peers = engine.peers
+        first = int(peers.before(ranks[n:].get())[0]) if peers.count > 1 else 0
         merged = self._room("merged", size=t.rows, dtype=np.int32)
         engine.run_each(
             k.mark_nuclei,
@@ -345,7 +346,7 @@ class InsertionDeletion:
         chosen = self._choose(t, keys, PAIR_RINGS)
         tally = self._room.zeros("tally", size=SHIFTS, dtype=np.int32)
         engine.run_each(k.count_pair_changes, n, chosen, pull, kinds, partners, strain_limit, tally)
-        changes = t.total(tally.get())
+        changes = engine.peers.total(tally.get())
         # The shift whose change is closest to the need; the smallest of equal ones.
         shifts = (np.arange(SHIFTS) - SHIFTS // 2) * SHIFT_STEP
         order = np.argsort(np.abs(shifts), kind="stable")
@@ -432,7 +433,7 @@ class InsertionDeletion:
             width = span // bins
             histogram = self._room.zeros("histogram", size=HISTOGRAM, dtype=np.int32)
             engine.run_each(k.count_sites, t.n, chosen, np.uint64(low), np.uint64(width), histogram)
-            from_top = np.cumsum(t.total(histogram.get())[:bins][::-1])
+            from_top = np.cumsum(engine.peers.total(histogram.get())[:bins][::-1])
             whole = int(np.searchsorted(from_top, most, side="right"))
             least = low + (bins - whole) * width
             most -= int(from_top[whole - 1]) if whole else 0
@@ -451,8 +452,8 @@ class InsertionDeletion:
         for place, counts in enumerate((marks.kept, marks.born)):
             self._scan.exclusive(counts, counts, n, total=(totals, place))
         kept, born = found = totals.get()
-        first = next_label + (0 if t.part is None else int(t.part.before(found)[1]))
-        (left, inserted), deleted = t.total(found).tolist(), self._count(t)
+        first = next_label + int(engine.peers.before(found)[1])
+        (left, inserted), deleted = engine.peers.total(found).tolist(), self._count(t)
         deleted -= left
         m = int(kept + born)
         if left + inserted == 0 or (deleted == 0 and inserted == 0):

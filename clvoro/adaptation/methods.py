@@ -77,7 +77,9 @@ class PublishedMethod(Method):
         poisson.subtract_mean_source(mesh.error, t.volumes, source)
         balance_components(mesh.domain, t, source, t.volumes)
         with engine.workspace.frame():
-            laplacian = poisson.assemble(t.starts, t.neighbors, t.face_measures, mesh.points, tolerance=r.tolerance)
+            laplacian = poisson.assemble(
+                t.starts, t.neighbors, t.face_measures, t.points, tolerance=r.tolerance, part=t.part
+            )
             solution = poisson.solve(laplacian, source, mesh.potential, tolerance=r.tolerance, ordering=mesh.labels)
         motion.compute_potential_gradient(t, mesh.potential, correction)
         mesh.summarize_displacements(lloyd, correction)
@@ -123,7 +125,13 @@ class WeightedMethod(Method):
         balance_components(mesh.domain, t, source, w.weight)
         with engine.workspace.frame():
             laplacian = poisson.assemble(
-                t.starts, t.neighbors, t.face_measures, mesh.points, w.density, tolerance=self.tolerance
+                t.starts,
+                t.neighbors,
+                t.face_measures,
+                t.points,
+                t.with_ghosts(engine, w.density),
+                tolerance=self.tolerance,
+                part=t.part,
             )
             # The labels are a new array whenever the order changes.
             solution = poisson.solve(

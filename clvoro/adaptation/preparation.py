@@ -396,7 +396,9 @@ def start(prepared: Prepared) -> MeshState:
     if len(taken) and levels == 0:
         placed, labels, taken = setup.place_fixed(placed, labels)
     with coincident_named(host, domain, engine.real):
-        arrays = {"points": engine.upload(placed), "labels": engine.upload(labels, np.int32)}
+        peers = engine.peers
+        begin, end = (part * len(placed) // peers.count for part in (peers.number, peers.number + 1))
+        arrays = {"points": engine.upload(placed[begin:end]), "labels": engine.upload(labels[begin:end], np.int32)}
         next_label = setup.first_row + len(host)
         return MeshState(setup, setup.factor * 2.0**levels, arrays, next_label=next_label, taken=taken)
 
@@ -416,7 +418,7 @@ def _sample(prepared: Prepared) -> np.ndarray:
 
 def only_needs_correction(prepared: Prepared, mesh: MeshState) -> tuple[bool, str]:
     """Return whether the points of the caller are a mesh that only needs a correction, and why; `mesh` is theirs."""
-    options, n = prepared.options, mesh.n
+    options, n = prepared.options, mesh.total
     if prepared.points is None or not options.multilevel:
         return False, ""
     if prepared.levels:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from ..arguments import check_callable, check_points
-from ..errors import InputTypeError, Interrupted
+from ..errors import InputError, InputTypeError, Interrupted
 from ..geometry.domain import Domain
 from ..mesh.diagram import Diagram
 from ..mesh.results import HISTORY_DTYPE, Displacements, Result, figures
@@ -25,6 +25,7 @@ from ..opencl.primitives import Summary
 from ..sizing.field import as_field
 from ..solvers.linear_system import Solution
 from ..tessellation.periodic.images import FewCellsError
+from ..tessellation.readback.parts import CellRows
 from .checkpoint import Checkpointer, Saved, run_fingerprint
 from .diagnostics import (
     MISSED,
@@ -35,6 +36,8 @@ from .diagnostics import (
     widths_of_layers,
 )
 from .fixed_points import check_fixed, origins, put_back
+from .gathering import ResultParts
+from .methods import MOVING
 from .motion import Displacement, Method
 from .options import Checkpoint, Options, uses
 from .plan.actions import CorrectCount, Refine, Step
@@ -66,6 +69,19 @@ def check_run(domain: object, size: object, callback: Callable[[np.void], object
         raise InputTypeError(
             f"size is the domain {size!r}, and domain is a {type(domain).__name__}; exchange them: run(domain, size)"
         )
+
+
+def check_shared(domain: Domain, options: Options, fixed: object, checkpoint: object) -> None:
+    """Raise if ranks cannot share such a run."""
+    what = ""
+    if not domain.may_have_parts:
+        what = f"domain is {domain!r:.80}, expected a Box with walls and without lines"
+    elif options.method in ("transport", *MOVING):
+        what = f"method is {options.method!r}, expected 'adaptive', or one that repeats a kind of step"
+    elif options.layers or fixed is not None or checkpoint is not None:
+        what = "layers, fixed generators or a checkpoint are given, expected none of them"
+    if what:
+        raise InputError(f"{what}, since ranks share the run; use an Adapter without comm")
 
 
 class Run:
@@ -113,10 +129,14 @@ class Run:
         self._stages, self._domain, self._options = stages, domain, options
         self._fixed = check_fixed(fixed, domain, stages.engine.real)
         self._files, self._callback, self._on_memory, self._alone = files, callback, on_memory, alone
+        # Over several parts displacements are not kept: generators change their part before the end.
+        self._whole = stages.engine.peers.count == 1
         self._begin(size, given, saved=None if files.source is None else Saved(files.source))
 
     def __repr__(self) -> str:
-        return f"Run({self.steps} steps, {self.state.n} cells on level {self.level}; {self.stop_reason or UNDER_WAY})"
+        return (
+            f"Run({self.steps} steps, {self.state.total} cells on level {self.level}; {self.stop_reason or UNDER_WAY})"
+        )
 
     def _begin(
         self, size: object, points: np.ndarray | None, max_levels: int | None = None, saved: Saved | None = None
@@ -129,7 +149,10 @@ class Run:
         if saved is not None:
             saved.check_fingerprint(fingerprint)
             max_levels = saved.levels
-        prepared = prepare(stages, self._domain, size, points, options, max_levels, self._fixed)
+        prepared = stages.engine.peers.agree(
+            lambda: prepare(stages, self._domain, size, points, options, max_levels, self._fixed),
+            lambda made: f"{self._domain!r} {options} {made.required!r} {made.target} {made.levels}",
+        )
         if hasattr(self, "state"):
             stages.release()  # memory of the mesh that the run has had
         if self._on_memory is not None:
@@ -164,7 +187,7 @@ class Run:
         self._kept_rows = prepared.kept_rows
         self.n_cells = self._options.n_cells if multilevel else None
         self._tol = None if multilevel else self._options.tol
-        self.n_start, self.started = self.state.n, self.state.next_label
+        self.n_start, self.started = self.state.total, self.state.next_label
         self.position = self.steps = self.obtuse = 0
         self.rows: list[np.ndarray] = []
         self.initial: Displacements | None = None
@@ -338,9 +361,9 @@ class Run:
 
     def note(self, displacement: Displacement) -> None:
         """Keep the displacement of the first and of the last step on the host."""
-        if self.initial is None:
+        if self._whole and self.initial is None:
             self.initial = self.state.displacements(displacement)
-        if self.position == self._last_step:
+        if self._whole and self.position == self._last_step:
             self.final = self.state.displacements(displacement)
         self.solution = displacement.solution
 
@@ -351,7 +374,7 @@ class Run:
             return
         answer = self._callback(self.rows[-1][0].copy())
         try:
-            self._stop = bool(answer)
+            self._stop = self._stages.engine.peers.any(bool(answer))
         except ValueError as error:  # a NumPy array has no truth value
             raise InputTypeError(
                 f"callback returned {answer!r:.60} of type {type(answer).__name__}, expected True to stop, False or "
@@ -363,14 +386,14 @@ class Run:
         if not self.rows:
             return False
         row, mesh = self.rows[-1][0], self.state
-        same = (row["step"], row["level"], row["cells"]) == (self.begun, self.level, mesh.n)
+        same = (row["step"], row["level"], row["cells"]) == (self.begun, self.level, mesh.total)
         # Before the first step the sizes are not scaled to a fixed number.
         scaled = self.fixed_count is None or self.steps > 0
         return bool(same and scaled and self.labeled == mesh.next_label)
 
     def _add_row(self, progress: float) -> None:
         mesh = self.state
-        s, n, labeled = mesh.summaries.read(), mesh.n, mesh.next_label
+        s, n, labeled = mesh.summaries.read(), mesh.total, mesh.next_label
         row: dict[str, float] = dict.fromkeys(HISTORY_DTYPE.fields or (), 0)
         row |= {"step": self.steps, "level": self.level, "cells": n, "progress": progress}
         row |= self._qualities(s)
@@ -391,7 +414,7 @@ class Run:
 
     def _qualities(self, s: dict[str, Summary]) -> dict[str, float]:
         """Return errors, qualities and energy for a row of the history, from the summaries `s`."""
-        mesh, n = self.state, self.state.n
+        mesh, n = self.state, self.state.total
         return {
             "mean_error": s["error"].magnitude / n,
             "max_error": s["error"].peak,
@@ -436,7 +459,7 @@ class Run:
         if not self._options.multilevel:
             warn_of_other_sizes(result)
         if result.converged and self._options.multilevel:
-            mean = float(np.abs(result.size_error).mean())
+            mean = float(result.history["mean_error"][-1])
             if mean > max(MISSED, self._options.error_target or 0.0):
                 warn_of_errors(result)
                 reason = f"{MISSES}: mean |e| {mean:.2g}"
@@ -452,7 +475,7 @@ class Run:
     def _read_result(self) -> Result:
         """Read the mesh. Raises InputError if cells of nearly coincident generators are wrong because of round-off."""
         mesh, final = self.state, self.final
-        if self.steps and (final is None or self.rows[-1]["step"] == self.rows[-2]["step"]):
+        if self._whole and self.steps and (final is None or self.rows[-1]["step"] == self.rows[-2]["step"]):
             # The last step was not known in advance, or generators have changed since.
             assert self.last is not None
             with mesh.engine.workspace.frame():
@@ -467,6 +490,9 @@ class Run:
         origin, fixed = origins(labels, self.started, mesh.taken), mesh.setup.points
         if self._kept_rows is not None:
             origin = np.where(origin < 0, -1, self._kept_rows[origin]).astype(np.int32)
+        parts = None
+        if not self._whole:
+            parts = ResultParts(mesh.engine, self._domain, CellRows.of(mesh.t, mesh.labels))
         diagram, settings = mesh.fetch_diagram(), dict(self._settings)
         if self._options.layers and self._domain.extrudes_layers:
             from ..finite_volumes.solid_walls.layers import add_layers
@@ -496,6 +522,7 @@ class Run:
             size_factor=mesh.size_factor,
             settings=settings,
             origin=origin,
+            parts=parts,
         )
         return without_holes(result)
 
@@ -520,7 +547,7 @@ class Run:
         target, own = options.error_target, EFFORTS[options.effort].error_target
         if options.method != "adaptive" or self._domain.cell_dim == 3 or not target:
             return
-        error = float(np.abs(result.size_error).mean())
+        error = float(result.history["mean_error"][-1])
         if target > own and error < REACHED * target:
             # Effort "fast" ends there because its steps end, not because the shape is as good as it gets.
             why = "" if options.effort == "fast" else ", as larger errors hardly give a better shape"

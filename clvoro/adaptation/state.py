@@ -22,8 +22,10 @@ from ..opencl.primitives import Summaries
 from ..sizing import Sizing
 from ..solvers.linear_system import Solution
 from ..tessellation.bins import BinnedPoints
+from ..tessellation.decomposition import distribute, is_balanced
 from ..tessellation.device_diagram import Tessellation
-from ..tessellation.readback.diagram import fetch_diagram, order_of
+from ..tessellation.readback.diagram import order_of
+from ..tessellation.readback.parts import fetch_part
 from ..tessellation.tessellator import Tessellator
 from .density import CellWeights
 from .fixed_points import clear_balls, take_places
@@ -160,7 +162,8 @@ class MeshState:
 
     Attributes
     ----------
-    n : int
+    n, total : int
+        Number of generators of this part, and of all parts of the domain.
     points : (n, d) real
         Normalized coordinates, in the order of the bins.
     labels : (n,) int32
@@ -214,7 +217,8 @@ class MeshState:
         if isinstance(start, Arrays):
             self._data = start
         n = len(start.generators) if isinstance(start, Arrays) else len(start["points"])
-        self.next_label = n if next_label is None else next_label
+        self.total = int(self.engine.peers.total(n))
+        self.next_label = self.total if next_label is None else next_label
         if isinstance(start, Arrays):
             self.tessellate_anew()
             return
@@ -254,7 +258,8 @@ class MeshState:
     def copy(self) -> MeshState:
         """Return a copy with stages of its own, whose diagram is computed anew."""
         engine = self.engine
-        setup = self.setup.on(Engine(engine.ctx, engine.queue, engine.dim, engine.real, engine.traits))
+        own = Engine(engine.ctx, engine.queue, engine.dim, engine.real, engine.traits, peers=engine.peers)
+        setup = self.setup.on(own)
         return MeshState(setup, self.size_factor, self._data.copy(), next_label=self.next_label, taken=self.taken)
 
     @property
@@ -365,7 +370,11 @@ class MeshState:
         SizeFieldError
             If a size is not positive and finite.
         """
-        stages, n = self.stages, len(rows["points"])
+        stages, peers = self.stages, self.engine.peers
+        if peers.count > 1 and (first or not is_balanced(len(rows["points"]), peers)):
+            rows = distribute(self.engine, self.domain, rows)
+        n = len(rows["points"])
+        self.total = int(peers.total(n))
         binned = stages.bins.build(self.domain, rows["points"], n)
         stages.bins.clear_work()
         items = binned.items[:n].copy()
@@ -415,7 +424,9 @@ class MeshState:
             self.compare_and_evaluate(first)
             return self._read(report)
 
-        data.tessellation = self.tessellator.tessellate(self.points, self.n, previous, binned=binned, follow=evaluate)
+        data.tessellation = self.tessellator.tessellate(
+            self.points, self.n, previous, binned=binned, follow=evaluate, labels=self.labels
+        )
 
     def tessellate_anew(self) -> None:
         """Tessellate the present points without an earlier diagram, and evaluate size, error and quality."""
@@ -490,7 +501,7 @@ class MeshState:
         if not self._knows_log_ratio:
             self.summaries.collect("log_ratio", w.log_ratio, self.n)
         self._knows_log_ratio = True
-        return self.summaries.read_one("log_ratio").magnitude / self.n / self.engine.cell_dim
+        return self.summaries.read_one("log_ratio").magnitude / self.total / self.engine.cell_dim
 
     def missing_cells(self, w: CellWeights | None = None) -> float:
         """Return how many more cells the size field requires; negative if there are too many.
@@ -500,14 +511,14 @@ class MeshState:
         with self.engine.workspace.frame():
             w = self.stages.density.cell_weights(self.t, self.h) if w is None else w
             self.summaries.collect("weight", w.weight, self.n)
-        return self.summaries.read_one("weight").sum - self.n
+        return self.summaries.read_one("weight").sum - self.total
 
     def normalize_sizes(self) -> None:
         """Scale the size field by the factor that makes the mean of log(L / h) zero; cells of layers have h = L."""
         with self.engine.workspace.frame():
             w = self.stages.density.cell_weights(self.t, self.h)
             self.summaries.collect("log_ratio", w.log_ratio, self.n)
-        free = self.n - max(self.fixed - self.setup.first_row, 0)
+        free = self.total - max(self.fixed - self.setup.first_row, 0)
         factor = math.exp(self.summaries.read_one("log_ratio").sum / free / self.engine.cell_dim)
         self.size_factor *= factor
         self.stages.metric.scale_sizes(factor, self.h)
@@ -529,8 +540,8 @@ class MeshState:
         self.engine.workspace.shrink()
         with self.engine.workspace.frame():
             w = self.stages.density.cell_weights(self.t, self.h)
-            missing = self.missing_cells(w) if n_cells is None else float(n_cells - self.n)
-            missing = min(missing, most - self.n)
+            missing = self.missing_cells(w) if n_cells is None else float(n_cells - self.total)
+            missing = min(missing, most - self.total)
             new = self.stages.insertion_deletion.insert_delete(
                 self.free,
                 self.t,
@@ -612,7 +623,7 @@ class MeshState:
         with self.engine.workspace.frame():
             displacement = self.engine.scratch(self.points.shape)
             count = self.stages.quality_descent.open_triangles(self.t, displacement)
-            if not count or count > MOST_OBTUSE * self.n:
+            if not count or count > MOST_OBTUSE * self.total:
                 return count, False
             self.zero_fixed(displacement)
             self.move(Displacement(displacement, displacement, self.local_length, correction_share=0.0, bound=0.5))
@@ -631,7 +642,7 @@ class MeshState:
 
     def refined_count(self) -> int:
         """Return the number of generators after `refine`."""
-        return self.stages.refinement.count(self.t)
+        return int(self.engine.peers.total(self.stages.refinement.count(self.t)))
 
     def refine(self, finest: bool = False) -> MeshState:
         """Return the mesh of the next finer level. The present generators keep their labels.
@@ -641,11 +652,10 @@ class MeshState:
         self.stages.metric.scale_sizes(0.5, self.h)
         rows = self.fixed if self.fixed > self.setup.first_row else 0
         finer = self.stages.refinement.refine(self.free, self.t, self.h, self.labels, rows)
-        start, n = {"points": finer}, len(finer)
+        start, n, peers = {"points": finer}, len(finer), self.engine.peers
         del finer
-        start["labels"] = self.engine.upload(
-            np.arange(self.next_label - self.n, self.next_label - self.n + n, dtype=np.int32), np.int32
-        )
+        begin = self.next_label - self.n + int(peers.before(n - self.n))
+        start["labels"] = self.engine.upload(np.arange(begin, begin + n, dtype=np.int32), np.int32)
         cl.enqueue_copy(
             self.engine.queue, buffer_of(start["labels"]), buffer_of(self.labels), byte_count=self.labels.nbytes
         )
@@ -656,7 +666,7 @@ class MeshState:
             start["points"], start["labels"] = map(self.engine.upload, new, (None, np.int32))
         # Free the other arrays. After an interruption `update` computes them again.
         self._data = Arrays(self._data.generators)
-        next_label = self.next_label + n - self.n
+        next_label = self.next_label + int(peers.total(n - self.n))
         return MeshState(self.setup, self.size_factor / 2, start, self.tessellator, next_label, taken)
 
     def finalize(self) -> bool:
@@ -666,12 +676,12 @@ class MeshState:
         """
         self.stages.clear_poisson()
         self.engine.workspace.shrink()
-        tessellator, sites = self._latest_tessellator, self.t.sites
+        tessellator, sites = self._latest_tessellator, self.t.sites if self.t.is_power else self.points
         again = not tessellator.is_complete(self.t)
         if again:
             # Free the present diagram before the new one is computed.
             self.tessellation = None
-            self.tessellation = tessellator.complete(self.points, sites, self.n)
+            self.tessellation = tessellator.complete(self.points, sites, self.n, self.labels)
         self.tessellation = tessellator.final(self.t)
         tessellator.steps.warn_of_leaks(self.t)
         self.evaluate_metric()
@@ -688,7 +698,7 @@ class MeshState:
         latest = [tessellator.steps.measure_exactly(self.t)]
         self.tessellation = None
         self.stages.release()
-        return fetch_diagram(tessellator.stages.engine, self.domain, latest.pop(), self.labels, copy=False)
+        return fetch_part(tessellator.stages.engine.alone(), self.domain, latest.pop(), self.labels)
 
 
 def _take_apart(new: Outcome | None) -> tuple[dict[str, cla.Array], tuple[int, int]]:

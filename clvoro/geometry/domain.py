@@ -174,6 +174,11 @@ class Domain(ClipBox):
         return not (self.curved or self.cuts_cells or any(self.periodic))
 
     @property
+    def may_have_parts(self) -> bool:
+        """Whether ranks can share a mesh of it."""
+        return self.plain and self.lines is None and self.wall_triangles is None
+
+    @property
     def globe(self) -> Sphere | None:
         """The sphere whose longitudes and latitudes positions have, or None."""
         return None

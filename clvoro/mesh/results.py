@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, overload
+from typing import TYPE_CHECKING, Any, Protocol, overload
 
 import numpy as np
 
@@ -46,6 +46,26 @@ HISTORY_DTYPE = np.dtype(
     ]
 )
 """Columns of the history: one row per step, and one more if cells or target sizes have changed after the last step."""
+
+
+class OtherParts(Protocol):
+    """The other parts of a mesh, as a `Result` of one of them sees them.
+
+    Attributes
+    ----------
+    number, count : int
+        Number of this part; number of parts.
+    labels : (n,) int32
+        Names of the cells in the whole mesh, ascending.
+    """
+
+    number: int
+    count: int
+    labels: np.ndarray
+
+    def gather(self, result: Result) -> Result | None:
+        """See `Result.gather`."""
+        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,6 +131,9 @@ class Result(Sealed, MeshOutput):
     origin : (n,) int32 or None
         Index of each generator in the points with which the run began, of a fixed one that of the point whose place it
         has taken; -1 for inserted generators, which come last.
+    parts : OtherParts or None
+        Over the ranks of MPI: what `gather` needs. The arrays above are then those of the cells of this rank, and faces
+        towards the cells of rank K are on a wall called ``"rankK"``, such as ``"rank1"``.
     """
 
     points: np.ndarray
@@ -126,6 +149,14 @@ class Result(Sealed, MeshOutput):
     size_factor: float = 1.0
     settings: dict[str, Any] = field(default_factory=dict)
     origin: np.ndarray | None = None
+    parts: OtherParts | None = None
+
+    def gather(self) -> Result | None:
+        """Return the mesh of all ranks on rank 0, with rows in the order of generators, and None on the others.
+
+        All ranks call this together. The result of a run without ranks returns itself.
+        """
+        return self if self.parts is None else self.parts.gather(self)
 
     @overload
     def check(self, solver: None = None, *, walls: WallShape | None = None) -> Report: ...

@@ -21,7 +21,7 @@ from .results import HISTORY_DTYPE, Result, figures
 Mesh = TypeVar("Mesh", Result, Diagram)
 
 
-def take_subset(mesh: Mesh, keep: object, boundary: str) -> Mesh:
+def take_subset(mesh: Mesh, keep: object, boundary: str | np.ndarray) -> Mesh:
     """Return `mesh` without the cells where `keep` is False; see `MeshOutput.subset`."""
     diagram = mesh.diagram if isinstance(mesh, Result) else mesh
     diagram.demand_voronoi("subset")
@@ -68,7 +68,9 @@ def _result_of(mesh: Result, part: Diagram, kept: np.ndarray) -> Result:
     """Return `mesh` with the diagram `part`, which has the cells `kept` (n,) bool."""
     taken = {name: getattr(mesh, name)[kept] for name in ("target_size", "size_error", "quality")}
     origin = None if mesh.origin is None else mesh.origin[kept]
-    return dataclasses.replace(mesh, points=part.points, diagram=part, **taken, initial=None, final=None, origin=origin)
+    return dataclasses.replace(
+        mesh, points=part.points, diagram=part, **taken, initial=None, final=None, origin=origin, parts=None
+    )
 
 
 def without_holes(mesh: Result) -> Result:

@@ -12,6 +12,7 @@ import pyopencl.array as cla
 from . import program, ranges
 from .device_array import make_array
 from .kernels import KernelPool, Kernels, bind, fit_group, range_of
+from .peers import ALONE, Peers
 from .ranges import enqueue_ranges
 from .workspace import Workspace
 
@@ -93,6 +94,8 @@ class Engine:
         Memory that stages use in turn; see `scratch`.
     pool : KernelPool, optional
         Kernels that stages take.
+    peers : Peers
+        The parts of the domain, of which the stages work on one.
 
     Attributes
     ----------
@@ -112,6 +115,7 @@ class Engine:
         *,
         workspace: Workspace | None = None,
         pool: KernelPool | None = None,
+        peers: Peers = ALONE,
     ) -> None:
         self.ctx, self.queue = ctx, queue
         self.dim, self.real, self.traits = dim, real, traits
@@ -124,6 +128,7 @@ class Engine:
             self.period_args = (vector,)
         self.workspace = Workspace(queue) if workspace is None else workspace
         self.pool = KernelPool() if pool is None else pool
+        self.peers = peers
 
     def replaced(self, *, real: np.dtype | None = None, traits: Traits | None = None) -> Engine:
         """Return an engine of another precision or other traits that shares workspace and kernels with this one."""
@@ -135,7 +140,12 @@ class Engine:
             self.traits if traits is None else traits,
             workspace=self.workspace,
             pool=self.pool,
+            peers=self.peers,
         )
+
+    def alone(self) -> Engine:
+        """Return an engine that shares kernels with this one, and works without the peers."""
+        return Engine(self.ctx, self.queue, self.dim, self.real, self.traits, pool=self.pool)
 
     @property
     def site_size(self) -> int:

@@ -135,7 +135,17 @@ class Summaries:
             self._values,
             self._record,
         )
+        if self.engine.peers.count > 1:
+            self._combine_parts([slot for slot in range(len(self.slots)) if self._pending >> slot & 1])
         self._pending = 0
+
+    def _combine_parts(self, slots: list[int]) -> None:
+        """Replace these summaries by those of all parts."""
+        values = self._values.get()
+        found = np.stack(self.engine.peers.gather(values[slots]))
+        values[slots, :2] = found[..., :2].sum(axis=0)
+        values[slots, 2], values[slots, 3] = found[..., 2].min(axis=0), found[..., 3].max(axis=0)
+        self._values.set(values)
 
     def read_one(self, name: str) -> Summary:
         """Return the summary with this name."""

@@ -57,6 +57,18 @@ class ConjugateGradient:
             )
         return self._kernels[store]
 
+    def sum_over_parts(self, *rows: int, largest: int | None = None) -> None:
+        """Replace these rows of the partial sums by their sums over all parts, and row `largest` by the maximum."""
+        peers = self.engine.peers
+        if peers.count == 1:
+            return
+        partial = self.partial.get().reshape(_ROWS, -1)
+        found = np.stack(peers.gather(partial[list(rows)]))
+        partial[list(rows)] = found.sum(axis=0)
+        if largest is not None:
+            partial[largest] = found[:, rows.index(largest)].max(axis=0)
+        self.partial.set(partial.ravel())
+
     @framed
     def solve(
         self,
@@ -288,9 +300,7 @@ class _Iteration:
         self._kernels = k = solver.kernels_in(store)
         scratch = self._engine.scratch
         self._r, self._u, self._q = (scratch(n, store) for _ in range(3))
-        part, all_n = operator.part, n
-        if part is not None:
-            all_n = int(part.total(np.array(n)))
+        part, all_n = operator.part, int(self._engine.peers.total(n))
         self._p = scratch(n if part is None else part.count, store)
         # On CPUs it costs more to evaluate directions of neighbors again than to store them.
         self._merged = operator.rows is not None and self._engine.group_size > 1
@@ -331,7 +341,7 @@ class _Iteration:
         k, anew = self._kernels, np.int32(from_zero)
         partial, state, _ = self._tail
         self._launch(k.sum_right_sides, self._size, anew, self._rhs, self._q, partial)
-        self._sum_over_parts(_SUM_B, _START, _MAX_B)
+        self._solver.sum_over_parts(_SUM_B, _START, _MAX_B, largest=_MAX_B)
         self._launch(
             k.start_residual,
             self._size,
@@ -346,7 +356,7 @@ class _Iteration:
             state,
             self._solver.counts,
         )
-        self._sum_over_parts(_NORM_B, _NORM_R, _SUM_R)
+        self._solver.sum_over_parts(_NORM_B, _NORM_R, _SUM_R)
 
     def begin(self) -> None:
         """Precondition the first residual."""
@@ -354,7 +364,7 @@ class _Iteration:
             self._launch(
                 self._kernels.precondition_jacobi, self._size, self._precondition, self._r, self._u, self._tail[0]
             )
-            self._sum_over_parts(_GAMMA)
+            self._solver.sum_over_parts(_GAMMA)
 
     def iterate(self, k: int) -> None:
         """Enqueue iteration k."""
@@ -369,9 +379,9 @@ class _Iteration:
             self._operator.apply(self._p, self._q)
             if not self._operator.writes_curvature:
                 self._dot_product(CURVATURE, self._p, self._q)
-            self._sum_over_parts(CURVATURE)
+            self._solver.sum_over_parts(CURVATURE)
         solution()
-        self._sum_over_parts(*(row + (k + 1) % 2 for row in (_NORM_R, _SUM_R, _GAMMA)))
+        self._solver.sum_over_parts(*(row + (k + 1) % 2 for row in (_NORM_R, _SUM_R, _GAMMA)))
 
     def record_norm(self) -> None:
         """Record the residual before the next iteration, and whether it is needed."""
@@ -380,20 +390,8 @@ class _Iteration:
 
     def center(self) -> None:
         """Subtract its mean from x."""
-        self._sum_over_parts(_SUM_X)
+        self._solver.sum_over_parts(_SUM_X)
         self._launch(self._kernels.center_solution, self._size, self._center, self._x, self._tail[0])
-
-    def _sum_over_parts(self, *rows: int) -> None:
-        """Replace these rows of the partial sums by their sums over all parts, and the maximum by the largest."""
-        part = self._operator.part
-        if part is None or part.peers is None:
-            return
-        partial = self._tail[0].get().reshape(_ROWS, -1)
-        found = np.stack(part.peers.gather(partial[list(rows)]))
-        partial[list(rows)] = found.sum(axis=0)
-        if _MAX_B in rows:
-            partial[_MAX_B] = found[:, rows.index(_MAX_B)].max(axis=0)
-        self._tail[0].set(partial.ravel())
 
     def _dot_product(self, row: int, a: cla.Array, b: cla.Array) -> None:
         self._launch(self._kernels.dot_product, self._size, np.int32(row), a, b, self._tail[0])

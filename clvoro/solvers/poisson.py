@@ -225,6 +225,7 @@ class Poisson:
         # These kernels are the same for both precisions of the weights, which are mostly single.
         partial, kernels = self._conjugate_gradient.partial, self._kernels_in(np.dtype(np.float32))
         self.engine.run_blocks(kernels.sum_sources, size, source, volumes, partial)
+        self._conjugate_gradient.sum_over_parts(0, 1)
         self.engine.run_blocks(kernels.subtract_mean_source, size, source, volumes, rhs, partial)
         return rhs
 
@@ -319,7 +320,7 @@ class Poisson:
         operator = Operator(self._apply_of(laplacian), writes_curvature=True, singular=True, rows=rows, part=part)
         system = _Equation(laplacian, operator, rhs, potential, tolerance)
         if part is not None:
-            preconditioner, n = "jacobi", int(part.total(np.array(n)))
+            preconditioner, n = "jacobi", int(self.engine.peers.total(n))
         if preconditioner == "auto":
             one_group = n <= one_group_limit(self.engine)
             factors = cost_factors(self.engine.queue.device)

@@ -194,7 +194,7 @@ class VolumeProjection:
             self._unread = ref(solution)
             return solution
         Launch(engine, k.assemble_projection, *given, self._counts, *rest)()
-        self._sum_over_parts(t, _NORM, _GAMMA)
+        self._sum_over_parts(_NORM, _GAMMA)
         direction = Launch(engine, k.update_projection_direction, *given, self._counts)
         update = Launch(engine, k.update_projection, *given, self._counts)
         rows = self._iterate(t, v, direction, update, most)
@@ -217,8 +217,8 @@ class VolumeProjection:
         """Return ASSEMBLY_ARGS of volume_projection.cl but for the start."""
         real, sums = self.engine.real.type, targets.sums
 
-        if sums is not None and t.part is not None and t.part.peers is not None:
-            sums = self.engine.upload(t.part.total(sums.get()))
+        if sums is not None and self.engine.peers.count > 1:
+            sums = self.engine.upload(self.engine.peers.total(sums.get()))
 
         def of_all(values: cla.Array) -> cla.Array:
             return t.with_ghosts(self.engine, values)
@@ -249,28 +249,28 @@ class VolumeProjection:
         engine = self.engine
         t.forward(engine, v.z)
         direction()
-        self._sum_over_parts(t, _CURVATURE)
+        self._sum_over_parts(_CURVATURE)
         done, ahead = 0, self._ahead
         while True:
             end = min(done + ahead, most)
             for turn in range(done, end):
                 t.forward(engine, v.s)
                 update()
-                self._sum_over_parts(t, _NORM + (turn + 1) % 2, _GAMMA + (turn + 1) % 2)
+                self._sum_over_parts(_NORM + (turn + 1) % 2, _GAMMA + (turn + 1) % 2)
                 t.forward(engine, v.z)
                 direction()
-                self._sum_over_parts(t, _CURVATURE)
+                self._sum_over_parts(_CURVATURE)
             rows = self._read(end)
             if not all(row[RECORD_RUNNING] for row in rows):
                 self._ahead = _first_stop(rows) + _SPARE
                 return rows
             done, ahead = end, 4
 
-    def _sum_over_parts(self, t: Tessellation, *rows: int) -> None:
+    def _sum_over_parts(self, *rows: int) -> None:
         """Replace these rows of the partial sums by their sums over all parts."""
-        if t.part is not None and t.part.peers is not None:
+        if self.engine.peers.count > 1:
             partial = self._partial.get().reshape(_ROWS, -1)
-            partial[list(rows)] = t.part.total(partial[list(rows)])
+            partial[list(rows)] = self.engine.peers.total(partial[list(rows)])
             self._partial.set(partial.ravel())
 
     def _read(self, end: int) -> list[list[float]]:

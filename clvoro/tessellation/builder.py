@@ -55,6 +55,8 @@ class CellBuilder(ABC):
                 "offsets": engine.empty((n, engine.dim)),
                 "covariances": engine.empty((n, MOMENTS[engine.cell_dim])),
             }
+            if engine.peers.shared:
+                self._all_cells["reach"] = engine.empty(n, np.float32)
         if n != self._n:
             self._cells = {name: a[: n + (name == "starts")] for name, a in self._all_cells.items()}
             self._n = n

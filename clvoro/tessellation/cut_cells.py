@@ -146,5 +146,6 @@ class Matching:
             volumes=cells["volumes"],
             offsets=cells["offsets"],
             covariances=cells["covariances"],
+            reach=cells.get("reach"),
             round_off=flags & (NARROW | UNEVEN),
         )

@@ -148,6 +148,8 @@ class Tessellation:
         How the diagram was made from that of generators and images. None after an update, and without images.
     trimmed : Trimmed, optional
         How a boundary cut it out of convex cells. None where no boundary cuts cells.
+    reach : (n,) float32, optional
+        Distance of the farthest corner of each cell from its generator, or a bound of it, if the domain has parts.
     round_off : int
         What round-off may have spoiled, for `topology3d.consistency`: bits `NARROW`, faces may be no wider than
         round-off, and `UNEVEN`, cells may differ about their common faces by more than a thousandth of a cell.
@@ -168,6 +170,7 @@ class Tessellation:
     whole: Tessellation | None = None
     folded: Folded | None = None
     trimmed: Trimmed | None = None
+    reach: cla.Array | None = None
     round_off: int = 0
     sites: cla.Array = None  # type: ignore[assignment]
 
@@ -189,6 +192,7 @@ class Tessellation:
             volumes=self.volumes[:n],
             offsets=self.offsets[:n],
             covariances=self.covariances[:n],
+            reach=None if self.reach is None else self.reach[:n],
         )
 
     def forward(self, engine: Engine, values: cla.Array) -> None:
@@ -199,10 +203,6 @@ class Tessellation:
     def with_ghosts(self, engine: Engine, values: cla.Array) -> cla.Array:
         """Return `values` (n, ...) and behind them those of ghosts, in the workspace; `values` if there are none."""
         return values if self.part is None else self.part.with_ghosts(engine, values)
-
-    def total(self, values: np.ndarray) -> np.ndarray:
-        """Return the sum of `values` over all parts of the domain; `values` if this is the whole."""
-        return values if self.part is None else self.part.total(values)
 
     def fixed_args(self, engine: Engine, labels: cla.Array | None, fixed: int) -> tuple[object, ...]:
         """Return `labels` (n,) int32 with those of ghosts, and `fixed`, as arguments of kernels.

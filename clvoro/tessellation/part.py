@@ -12,9 +12,8 @@ position of a neighbor take its nearest image (the PERIODIC macros).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pyopencl as cl
@@ -23,33 +22,11 @@ import pyopencl.array as cla
 from ..geometry.domain import ClipBox
 from ..opencl.device_array import buffer_of
 from ..opencl.engine import Engine
+from ..opencl.peers import Peers
 from ..opencl.primitives import Gather
 
 if TYPE_CHECKING:
     from .device_diagram import Tessellation
-
-
-class Peers(Protocol):
-    """The parts of a domain as one of them sees them: ranks, or devices of a process.
-
-    All of them call the same methods in the same order.
-
-    Attributes
-    ----------
-    number, count : int
-        Number of this part; number of parts.
-    """
-
-    number: int
-    count: int
-
-    def exchange(self, sent: Sequence[np.ndarray]) -> list[np.ndarray]:
-        """Send array k to part k, and return what each part has sent to this one, in the order of parts."""
-        ...
-
-    def gather(self, values: np.ndarray) -> list[np.ndarray]:
-        """Return the `values` of all parts, in their order."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -67,6 +44,8 @@ class Ghosts:
         The images of generator i begin at ``firsts[i]``.
     peers : Peers, optional
         If owners are in other parts. Ghosts are then in the order of these.
+    parts : (g,) int
+        With `peers`, the part of each owner, on the host.
     sent : tuple of int32 arrays, device
         Rows of this part whose values each of the parts needs.
     """
@@ -75,6 +54,7 @@ class Ghosts:
     codes: cla.Array | None = None
     firsts: cla.Array | None = None
     peers: Peers | None = None
+    parts: np.ndarray | tuple[int, ...] = ()
     sent: tuple[cla.Array, ...] = ()
 
     @classmethod
@@ -85,7 +65,7 @@ class Ghosts:
         """
         wanted = [np.ascontiguousarray(rows[parts == part], np.int32) for part in range(peers.count)]
         sent = tuple(engine.upload(needed, np.int32) for needed in peers.exchange(wanted))
-        return cls(engine.upload(rows, np.int32), peers=peers, sent=sent)
+        return cls(engine.upload(rows, np.int32), peers=peers, parts=parts, sent=sent)
 
     def fill(self, engine: Engine, n_own: int, values: cla.Array) -> None:
         """Fill the rows of `values` from `n_own` on with the values of the owners; see `Part.forward`."""
@@ -156,14 +136,28 @@ class Part:
         return named
 
     def order_rows(self, engine: Engine, t: Tessellation, defines: dict[str, object]) -> None:
-        """Sort the rows of `t`, a diagram of this part, by the labels, and measure its cells again.
+        """Sort the rows of `t`, a diagram of this part, by the labels, and measure its cells and their reach again.
 
         `defines` are those of the builder of its cells.
         """
         given = (t.starts, t.neighbors, self.labels, t.sites, *self.box.clip_args(engine), *t.vertices[:1])
-        measures = t.face_measures, t.face_centroids, t.volumes, t.offsets, t.covariances
+        reach = engine.scratch(t.n, np.float32) if t.reach is None else t.reach
+        measures = t.face_measures, t.face_centroids, t.volumes, t.offsets, t.covariances, reach
         order = engine.kernels("tessellation/row_order", defines).order_rows
         engine.run_each(order, t.n, *given, *measures, *(engine.period_args if t.vertices else ()))
+
+    def measure_faces(self, engine: Engine, t: Tessellation, defines: dict[str, object]) -> Tessellation:
+        """Return `t`, a diagram of this part, with face measures and centroids in full precision, in new arrays."""
+        m = len(t.neighbors)
+        t = replace(t, face_measures=engine.empty(m), face_centroids=engine.empty((m, engine.dim)))
+        self.order_rows(engine, t, {**defines, "FACE": engine.name_of(engine.real)})
+        return t
+
+    def neighboring_ghosts(self, engine: Engine, t: Tessellation) -> np.ndarray:
+        """Return the rows of ghosts that are neighbors of own generators in `t`, a diagram of this part, (k,) int."""
+        marks = engine.zeros(max(self.count - self.n_own, 1), np.int32)
+        engine.run_each(engine.kernels("tessellation/part").mark_ghosts, self.n_own, t.starts, t.neighbors, marks)
+        return self.n_own + np.flatnonzero(marks.get()[: self.count - self.n_own])
 
     def forward(self, engine: Engine, values: cla.Array) -> None:
         """Fill the rows of ghosts in `values` (count, ...), of whole 32-bit words, with the values of their owners.
@@ -175,16 +169,9 @@ class Part:
 
     def with_ghosts(self, engine: Engine, values: cla.Array) -> cla.Array:
         """Return `values` (n_own, ...) and behind them those of ghosts, in the workspace."""
+        if self.ghosts is None:
+            return values
         extended = engine.scratch((self.count, *values.shape[1:]), values.dtype)
         cl.enqueue_copy(engine.queue, buffer_of(extended), buffer_of(values), byte_count=values.nbytes)
         self.forward(engine, extended)
         return extended
-
-    def total(self, values: np.ndarray) -> np.ndarray:
-        """Return the sum of `values` over all parts, in the order of parts."""
-        return values if self.peers is None else np.sum(self.peers.gather(values), axis=0)
-
-    def before(self, values: np.ndarray) -> np.ndarray:
-        """Return the sum of `values` over the parts before this one."""
-        earlier = [] if self.peers is None else self.peers.gather(values)[: self.peers.number]
-        return sum(earlier, np.zeros_like(values))

@@ -25,6 +25,8 @@ from .periodic.halo import Halo
 from .polyhedra import Polyhedra
 from .stages import TessellationStages
 
+LATER_FROM = 10_000
+"""Cells from which those of periodic images, if they are the larger part, are built once the halo is known."""
 Sort: TypeAlias = Callable[[], BinnedPoints]
 """Returns the generators in bins, and sorts them when it is first called."""
 
@@ -49,8 +51,11 @@ class DomainSteps:
         self.stages, self.domain, self.box = stages, domain, domain
         self.most = stages.engine.empty(1, np.int32)
 
-    def begin(self, n: int, last: bool = False) -> None:
-        """Prepare for a new diagram of `n` generators, the `last` one of a run."""
+    def begin(self, n: int, last: bool = False, labels: cla.Array | None = None) -> None:
+        """Prepare for a new diagram of `n` generators, the `last` one of a run.
+
+        In a part of a domain they have `labels` (n,), a new array for other generators.
+        """
 
     def extend(self, sites: cla.Array, n: int) -> Part:
         """Return the part of the first `n` of `sites` and the ghosts that their cells need, as far as known."""
@@ -74,8 +79,18 @@ class DomainSteps:
     def find_walls(self, part: Part, binned: BinnedPoints, previous: Tessellation | None) -> None:
         """Find what bounds the new cells of `part` besides its box. `previous` has the same generators."""
 
-    def rows(self, previous: Tessellation) -> Tessellation | NeighborRows:
-        """Return the graph from which new cells may start, as long as they are built."""
+    def builds_all(self, part: Part, complete: bool, enough: bool) -> bool:
+        """Return whether ghosts of `part` get cells; those without values need them, since something cuts these.
+
+        Parameters
+        ----------
+        complete, enough : bool
+            The diagram is to be `complete`; its ghosts are known to be enough. Many images wait until they are.
+        """
+        return part.ghosts is None or (complete and (enough or part.count < max(2 * part.n_own, LATER_FROM)))
+
+    def rows(self, previous: Tessellation) -> Tessellation | NeighborRows | None:
+        """Return the graph from which new cells may start, as long as they are built, if there is one."""
         return previous
 
     def unfold(self, part: Part, rows: Tessellation | NeighborRows) -> Tessellation | NeighborRows:

@@ -15,13 +15,11 @@ from .bins import BinnedPoints
 from .clipped.cut import Cut
 from .device_diagram import CloseError, Follow, NeighborRows, Tessellation, read_report
 from .part import Part
+from .part_steps import PartSteps
 from .periodic.images import Images
 from .power import Rings
 from .stages import TessellationStages
 from .steps import DomainSteps, SolidWalls, Sort
-
-LATER_FROM = 10_000
-"""Cells from which those of periodic images, if they are the larger part, are built once the halo is known."""
 
 
 class Tessellator:
@@ -66,9 +64,11 @@ class Tessellator:
             domain.require_power_diagrams()
         self.domain, self.weighted = domain, weighted
         self.stages = stages.weighted if weighted else stages
-        if any(domain.periodic):
+        if stages.engine.peers.shared:
+            self.steps: DomainSteps = PartSteps(self.stages, domain)
+        elif any(domain.periodic):
             halo = None if coarser is None else coarser.steps.halo
-            self.steps: DomainSteps = Images(self.stages, domain, halo)
+            self.steps = Images(self.stages, domain, halo)
         elif domain.outline is not None:
             self.steps = Cut(self.stages, domain.outline, spacing, straight)
         elif domain.wall_triangles is not None:
@@ -86,6 +86,7 @@ class Tessellator:
         binned: BinnedPoints | None = None,
         follow: Follow = read_report,
         complete: bool = False,
+        labels: cla.Array | None = None,
     ) -> Tessellation:
         """Tessellate by the first `n` of `points` (n, d), in normalized coordinates.
 
@@ -101,6 +102,8 @@ class Tessellator:
             See `Follow`.
         complete : bool
             Make all that `final` needs: in a periodic box the cells of images as well.
+        labels : (n,) int32, optional
+            Permanent names of the generators, which parts of a domain need; a new array for other generators.
 
         Raises
         ------
@@ -117,7 +120,7 @@ class Tessellator:
                 t = self.steps.update(points, n, previous, sort, follow)
                 if t is not None:
                     return t
-            t = self._build(points, points, n, sort, previous, exact, complete)
+            t = self._build(points, points, n, sort, previous, exact, complete, labels)
         follow(t, None)
         return t
 
@@ -161,12 +164,18 @@ class Tessellator:
             return self.build(points, sites, n, exact, complete)
 
     def build(
-        self, points: cla.Array, sites: cla.Array, n: int, exact: bool = False, complete: bool = False
+        self,
+        points: cla.Array,
+        sites: cla.Array,
+        n: int,
+        exact: bool = False,
+        complete: bool = False,
+        labels: cla.Array | None = None,
     ) -> Tessellation:
         """Tessellate from nothing by the first `n` of `sites`: `points`, with their weights in a power diagram."""
         with self._in_units(points, n):
             whole = Part.alone(sites, self.domain, n)
-            return self._build(points, sites, n, cache(lambda: self._sorted(whole)), None, exact, complete)
+            return self._build(points, sites, n, cache(lambda: self._sorted(whole)), None, exact, complete, labels)
 
     def tessellate_part(self, part: Part, exact: bool = False, whole: bool = False) -> Tessellation:
         """Return the diagram of a part whose ghosts are given, such as the halo of generators of other parts.
@@ -188,11 +197,12 @@ class Tessellator:
         previous: Tessellation | None,
         exact: bool,
         complete: bool,
+        labels: cla.Array | None = None,
     ) -> Tessellation:
         steps = self.steps
         rows = None if previous is None or not self.stages.cells.from_previous else steps.rows(previous)
         nearest = not (exact or self.weighted)
-        steps.begin(n, last=complete)
+        steps.begin(n, complete, labels)
         if sample := steps.sample_size(n):
             self._find_ghosts(points, sites, n, sample, complete)
         enough = False
@@ -201,8 +211,7 @@ class Tessellator:
             binned = sort() if part.points is sites else self._sorted(part)
             steps.find_walls(part, binned, previous)
             try:
-                # Ghosts without values need cells, since something cuts these. Many images wait until they are enough.
-                whole = part.ghosts is None or (complete and (enough or part.count < max(2 * n, LATER_FROM)))
+                whole = steps.builds_all(part, complete, enough)
                 start = None if rows is None else steps.unfold(part, rows)
                 t = self._cells(part, binned, exact, part.count if whole else n, start)
             except CloseError:
@@ -212,7 +221,7 @@ class Tessellator:
             found = steps.finish(part, t, points, exact, nearest)
             enough = found is not None
             if found is not None and (whole or not complete):
-                return replace(found, points=points, sites=sites)
+                return found if found.part is not None else replace(found, points=points, sites=sites)
             # Memory for the new diagram.
             del part, binned, t
 
@@ -251,10 +260,10 @@ class Tessellator:
         """Return whether `final` can take `t`, the latest diagram, as it is."""
         return self.steps.is_complete(t)
 
-    def complete(self, points: cla.Array, sites: cla.Array, n: int) -> Tessellation:
+    def complete(self, points: cla.Array, sites: cla.Array, n: int, labels: cla.Array | None = None) -> Tessellation:
         """Return the diagram of the first `n` of `points`, with weights in `sites`, made anew for `final`."""
         self.stages.clear_folded_cells()
-        return self.build(points, sites, n, exact=self.weighted, complete=True)
+        return self.build(points, sites, n, exact=self.weighted, complete=True, labels=labels)
 
     def final(self, t: Tessellation) -> Tessellation:
         """Return `t`, the latest diagram, with faces in full precision and all that its vertices need."""
@@ -263,6 +272,11 @@ class Tessellator:
         stages, folded = self.stages, t.folded
         if t.face_measures.dtype == stages.engine.real:
             return t
+        if t.part is not None:
+            measured = t.part.measure_faces(stages.engine, t.whole or t, stages.cells.defines)
+            return replace(
+                t, face_measures=measured.face_measures, face_centroids=measured.face_centroids, whole=measured
+            )
         if folded is None or folded.whole is None:
             return stages.cells.measure_faces(self.domain, t)
         whole = stages.cells.measure_faces(folded.part.box, folded.whole)

@@ -132,7 +132,11 @@ def test_damaged_files_are_refused(tmp_path, convention, change, message):
 
 def test_other_files_are_refused(tmp_path):
     path = tmp_path / "mesh.nc"
-    for content, message in ((b"\x89HDF\r\n", "nccopy|NetCDF"), (b"CDF", "damaged or not a netCDF"), (b"", "another kind")):
+    for content, message in (
+        (b"\x89HDF\r\n", "nccopy|NetCDF"),
+        (b"CDF", "damaged or not a netCDF"),
+        (b"", "another kind"),
+    ):
         path.write_bytes(content)
         with pytest.raises(InputError, match=rf"cannot load .*mesh\.nc: .*{message}"):
             clvoro.load(path)

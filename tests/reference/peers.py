@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import threading
 
+from clvoro.opencl.peers import Peers
+
 WAIT = 60.0
 """Seconds after which a thread that waits for the others gives up."""
 
 
-class Threads:
+class Threads(Peers):
     """The peers of one thread: arrays are handed over between two barriers."""
+
+    shared = True
 
     def __init__(self, number, count, barrier, table):
         self.number, self.count, self._barrier, self._table = number, count, barrier, table

@@ -9,6 +9,7 @@ import scipy
 from clvoro.adaptation.insertion_deletion import CellSizes, Change, Generators
 from clvoro.adaptation.stages import Stages
 from clvoro.geometry.box import Box
+from clvoro.opencl.peers import ALONE
 from clvoro.solvers.linear_system import Limits
 from clvoro.solvers.volume_projection import Penalty, Targets
 from clvoro.tessellation.part import Ghosts, Part
@@ -43,8 +44,10 @@ class Halves:
         self.rows = [np.concatenate([numbers[own], numbers[~own & near]]) for own in (left, ~left)]
         self.n_own = np.diff(self.bounds).tolist()
 
-    def stages(self):
-        return Stages(patch.make_engine(self.ctx, self.real, self.box.dim, box=self.box))
+    def stages(self, peers=ALONE):
+        stages = Stages(patch.make_engine(self.ctx, self.real, self.box.dim, box=self.box))
+        stages.engine.peers = peers
+        return stages
 
     def part(self, stages, peers=None):
         """Return the part of a thread, or the whole."""
@@ -66,7 +69,7 @@ class Halves:
         whole = work(stages, self.part(stages), np.arange(self.n))
 
         def of_part(peers):
-            own = self.stages()
+            own = self.stages(peers)
             return work(own, self.part(own, peers), self.rows[peers.number])
 
         return whole, run_parts(2, of_part)
@@ -141,8 +144,9 @@ def test_ghosts_get_the_values_of_their_owners(ctx, dim, values, columns):
         device = stages.engine.upload(filled, values)
         part.forward(stages.engine, device)
         assert np.array_equal(device.get(), given[rows])
-        assert np.array_equal(part.total(np.array([part.n_own])), [halves.n])
-        assert part.before(np.array([part.n_own])) == rows[0]
+        peers = stages.engine.peers
+        assert np.array_equal(peers.total(np.array([part.n_own])), [halves.n])
+        assert peers.before(np.array([part.n_own])) == rows[0]
 
     halves.run(work)
     # Ghosts without owner keep their values, and so do all if they have no owners.

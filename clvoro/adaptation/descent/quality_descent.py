@@ -84,8 +84,8 @@ class QualityDescent:
         """
         engine, k, real = self.engine, self._kernels, self.engine.real.type
         with engine.workspace.frame():
-            forces, rows = engine.scratch((t.rows, 4)), t if t.part is None else t.whole
-            assert rows is not None, "rows of neighbors are read"
+            forces, rows = engine.scratch((t.rows, 4)), t.whole or t
+            assert rows.n == t.rows, "rows of neighbors are read"
             engine.run(
                 k.compute_cell_forces,
                 -(-t.n // 4),

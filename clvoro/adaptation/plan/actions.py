@@ -69,12 +69,12 @@ class InsertDelete:
     def apply(self, run: Run) -> None:
         """Insert and delete."""
         mesh = run.state
-        if self.least and abs(missing(run)) <= self.least * mesh.n:
+        if self.least and abs(missing(run)) <= self.least * mesh.total:
             return
         # The solver cannot reuse its large buffers for other generators.
         mesh.stages.clear_poisson()
         most = math.inf if run.fixed_count is not None else max_cells(run)
-        mesh.insert_delete(round(self.nuclei * mesh.n), run.fixed_count, climb_strain=self.climb_strain, most=most)
+        mesh.insert_delete(round(self.nuclei * mesh.total), run.fixed_count, climb_strain=self.climb_strain, most=most)
 
 
 @dataclass(frozen=True)
@@ -130,7 +130,7 @@ class CorrectCount:
         mesh.delete_squeezed()
         while self.share or run.fixed_count is not None:
             lack = missing_for_next_level(run, self.ahead) if self.ahead else missing(run)
-            if abs(lack) <= self.share * mesh.n:
+            if abs(lack) <= self.share * mesh.total:
                 break
             # At jumps of h each new cell changes the required number, so that it can oscillate without end. Changes
             # of one sign end by themselves.
@@ -141,7 +141,7 @@ class CorrectCount:
             before = lack
             if oscillations == MAX_OSCILLATIONS:
                 break
-            target = mesh.n + round(lack) if self.ahead else run.fixed_count
+            target = mesh.total + round(lack) if self.ahead else run.fixed_count
             most = math.inf if target is not None else max_cells(run)
             inserted, deleted = mesh.insert_delete(0, target, climb=False, most=most)
             if inserted == deleted:
@@ -191,14 +191,14 @@ class Prescribe:
 def count_changed(run: Run, steps: int) -> bool:
     """Return whether the number of cells of this level has changed since the last `steps` steps."""
     rows = [row[0] for row in run.rows[-steps:]]
-    return any(row["level"] == run.level and row["cells"] != run.state.n for row in rows)
+    return any(row["level"] == run.level and row["cells"] != run.state.total for row in rows)
 
 
 def missing(run: Run) -> float:
     """Return the number of missing cells, by the fixed number or by the size field."""
     if run.fixed_count is not None:
-        return float(run.fixed_count - run.state.n)
-    return min(run.state.missing_cells(), max_cells(run) - run.state.n)
+        return float(run.fixed_count - run.state.total)
+    return min(run.state.missing_cells(), max_cells(run) - run.state.total)
 
 
 def max_cells(run: Run) -> float:
@@ -225,9 +225,9 @@ def missing_for_next_level(run: Run, growth: float) -> float:
     factor = 2.0**mesh.engine.cell_dim
     # The number of cells on this level according to the integral.
     exact = run.target / factor**run.level
-    bias = min((mesh.n + mesh.missing_cells()) / exact - 1, MOST_SURPLUS)
-    lack = factor * mesh.n / (growth * mesh.refined_count()) - 1
+    bias = min((mesh.total + mesh.missing_cells()) / exact - 1, MOST_SURPLUS)
+    lack = factor * mesh.total / (growth * mesh.refined_count()) - 1
     wanted = exact * (1 + SAMPLING_GAIN * bias)
     for level in range(run.level):
         wanted *= 1 + lack / 2**level
-    return wanted - mesh.n
+    return wanted - mesh.total

@@ -62,7 +62,7 @@ class Images(DomainSteps):
         self.most = self._halo.most
         self._factor, self._grow, self._room = 1.0, False, 1.0
 
-    def begin(self, n: int, last: bool = False) -> None:
+    def begin(self, n: int, last: bool = False, labels: cla.Array | None = None) -> None:
         """Take the depth of the halo from the latest diagram, or estimate it, for `n` generators."""
         halo, dim = self._halo, self.domain.dim
         if halo.cells == 0:

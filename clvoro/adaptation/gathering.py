@@ -1,0 +1,56 @@
+"""The result of a run over several parts: each has its own cells, and all of them gather the whole mesh."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ..geometry.domain import Domain
+from ..mesh.results import Result
+from ..opencl.engine import Engine
+from ..tessellation.readback.parts import CellRows
+
+_OF_CELLS = ("target_size", "size_error", "quality", "origin")
+"""Arrays of a result with one row per cell."""
+
+
+@dataclass(frozen=True)
+class ResultParts:
+    """What `Result.gather` needs; see `clvoro.mesh.results.OtherParts`."""
+
+    engine: Engine
+    domain: Domain
+    rows: CellRows
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(None), ()  # without MPI the cells of a rank are a mesh of their own
+
+    @property
+    def number(self) -> int:
+        """Number of this part."""
+        return self.engine.peers.number
+
+    @property
+    def count(self) -> int:
+        """Number of parts."""
+        return self.engine.peers.count
+
+    @property
+    def labels(self) -> np.ndarray:
+        """Names of the cells in the whole mesh, in the order of the rows of the result."""
+        return np.sort(self.rows.labels)
+
+    def gather(self, result: Result) -> Result | None:
+        """Return the whole mesh on part 0, and None on the others."""
+        peers = self.engine.peers
+        rows, labels = self.rows.gather(peers), peers.collect(self.labels)
+        found = {name: peers.collect(getattr(result, name)) for name in _OF_CELLS}
+        if rows is None:
+            return None
+        order = np.argsort(np.concatenate(labels), kind="stable")
+        diagram = rows.diagram(self.engine.alone(), self.domain)
+        arrays = {name: np.concatenate(values)[order] for name, values in found.items()}
+        return dataclasses.replace(result, points=diagram.points, diagram=diagram, parts=None, **arrays)

@@ -1,0 +1,217 @@
+"""The parts of a domain as one of them sees them: alone, or as one of the ranks of MPI."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from typing import Any, TypeVar, cast
+
+import numpy as np
+
+from ..errors import InputError, InputTypeError, RankError
+
+Made = TypeVar("Made")
+PATIENCE, NAP = 200, 5e-5
+"""How often a rank asks for a message before it sleeps between two questions, and for how many seconds. Ranks may be
+more than cores."""
+ALARM = 1
+"""Tag of the message that a rank sends when it fails."""
+
+
+class Peers:
+    """The parts of a domain as one of them sees them. All of them call the same methods in the same order.
+
+    This class is a part that is alone: the whole domain. Others replace `exchange` and `gather`.
+
+    Attributes
+    ----------
+    number, count : int
+        Number of this part; number of parts.
+    shared : bool
+        Whether the domain is one of parts: rows of cells are then in the order of labels. There may be a single part.
+    exchanges, reductions : int
+        Calls of `exchange` and of `gather` so far.
+    """
+
+    number, count, shared = 0, 1, False
+    exchanges = reductions = 0
+
+    def exchange(self, sent: Sequence[np.ndarray]) -> list[np.ndarray]:
+        """Send array k to part k, and return what each part has sent to this one, in the order of parts.
+
+        Arrays differ in their number of rows only.
+        """
+        return list(sent)
+
+    def gather(self, values: np.ndarray) -> list[np.ndarray]:
+        """Return the `values` of all parts, arrays of one shape, in their order."""
+        return [values]
+
+    def total(self, values: Any) -> np.ndarray:
+        """Return the sum of `values` over all parts, in the order of parts."""
+        values = np.asarray(values)
+        return values if self.count == 1 else np.sum(self.gather(values), axis=0)
+
+    def before(self, values: Any) -> np.ndarray:
+        """Return the sum of `values` over the parts before this one."""
+        values = np.asarray(values)
+        earlier = self.gather(values)[: self.number] if self.count > 1 else []
+        return sum(earlier, np.zeros_like(values))
+
+    def any(self, condition: bool) -> bool:
+        """Return whether `condition` holds in any part."""
+        return condition if self.count == 1 else bool(self.total(np.array(condition, np.int32)))
+
+    def collect(self, values: np.ndarray) -> list[np.ndarray]:
+        """Return the `values` of all parts, which may differ in their number of rows, on part 0, else nothing."""
+        found = self.exchange([values if part == 0 else values[:0] for part in range(self.count)])
+        return found if self.number == 0 else []
+
+    def agree(self, prepare: Callable[[], Made], describe: Callable[[Made], str]) -> Made:
+        """Return what `prepare` returns, if the parts describe it alike.
+
+        Raises
+        ------
+        InputError
+            If they do not.
+        RankError
+            If it raises an error in another part.
+        """
+        if self.count == 1:
+            return prepare()
+        error, made, text = None, None, ""
+        try:
+            made = prepare()
+            text = describe(made)
+        except Exception as caught:
+            error, text = caught, f"\0{type(caught).__name__}: {caught}"
+        found = [
+            sent.tobytes().decode() for sent in self.exchange([np.frombuffer(text.encode(), np.uint8)] * self.count)
+        ]
+        if error is not None:
+            raise error
+        for number, other in enumerate(found):
+            if other.startswith("\0"):
+                raise RankError(f"rank {number} of {self.count} has failed: {other[1:]}")
+        differ = [number for number, other in enumerate(found) if other != found[0]]
+        if differ:
+            raise InputError(
+                f"rank {differ[0]} has other input than rank 0, or another version of clvoro: {found[differ[0]]:.300} "
+                f"in place of {found[0]:.300}; give all ranks the same arguments"
+            )
+        return cast("Made", made)
+
+    def fail(self, error: BaseException) -> None:
+        """Tell the others that this part fails. They raise a `RankError` where they wait for it."""
+
+
+ALONE = Peers()
+
+
+class Ranks(Peers):
+    """The ranks of an MPI communicator, which is duplicated: all of its ranks create this together.
+
+    Parameters
+    ----------
+    comm : mpi4py.MPI.Comm
+
+    Raises
+    ------
+    InputTypeError
+        If `comm` is no communicator.
+    """
+
+    shared = True
+
+    def __init__(self, comm: Any) -> None:
+        if not (hasattr(comm, "Dup") and hasattr(comm, "Iallgather")):
+            raise InputTypeError(
+                f"comm is {comm!r:.60} of type {type(comm).__name__}, expected a communicator of mpi4py; write "
+                "comm=MPI.COMM_WORLD after `from mpi4py import MPI`, with `pip install clvoro[mpi]`"
+            )
+        self._comm, self._alarms = comm.Dup(), comm.Dup()
+        self.number, self.count = comm.Get_rank(), comm.Get_size()
+        self._failed = ""
+
+    def exchange(self, sent: Sequence[np.ndarray]) -> list[np.ndarray]:
+        """Tell the others the numbers of rows, then send the rows."""
+        self.exchanges += 1
+        own = sent[self.number]
+        sizes, found = np.array([len(values) for values in sent], np.int64), np.empty(self.count, np.int64)
+        self._complete(self._comm.Ialltoall(sizes, found))
+        received = [np.empty((int(size), *own.shape[1:]), own.dtype) for size in found]
+        received[self.number] = own
+        others = [part for part in range(self.count) if part != self.number]
+        requests = [self._comm.Irecv(_bytes(received[part]), part) for part in others if found[part]]
+        packed = {part: np.ascontiguousarray(sent[part]) for part in others if sizes[part]}
+        requests += [self._comm.Isend(_bytes(values), part) for part, values in packed.items()]
+        self._complete(*requests)
+        return received
+
+    def gather(self, values: np.ndarray) -> list[np.ndarray]:
+        """Collect one array of each rank on all of them."""
+        self.reductions += 1
+        values = np.asarray(values, order="C")
+        found = np.empty((self.count, *values.shape), values.dtype)
+        self._complete(self._comm.Iallgather(_bytes(values), _bytes(found)))
+        return list(found)
+
+    def _complete(self, *requests: Any) -> None:
+        """Wait for `requests`, unless a rank fails."""
+        if self._failed:
+            raise RankError(self._failed)
+        turns = 0
+        while not all(request.Test() for request in requests):
+            turns += 1
+            if turns > PATIENCE:
+                if self._alarms.Iprobe(tag=ALARM):
+                    self._failed = self._alarms.recv(tag=ALARM)
+                    raise RankError(self._failed)
+                time.sleep(NAP)
+
+    def agree(self, prepare: Callable[[], Made], describe: Callable[[Made], str]) -> Made:
+        """Return what `prepare` returns, if the parts describe it alike.
+
+        Raises
+        ------
+        InputError
+            If they do not.
+        RankError
+            If it raises an error in another part.
+        """
+        if self.count == 1:
+            return prepare()
+        error, made, text = None, None, ""
+        try:
+            made = prepare()
+            text = describe(made)
+        except Exception as caught:
+            error, text = caught, f"\0{type(caught).__name__}: {caught}"
+        found = [
+            sent.tobytes().decode() for sent in self.exchange([np.frombuffer(text.encode(), np.uint8)] * self.count)
+        ]
+        if error is not None:
+            raise error
+        for number, other in enumerate(found):
+            if other.startswith("\0"):
+                raise RankError(f"rank {number} of {self.count} has failed: {other[1:]}")
+        differ = [number for number, other in enumerate(found) if other != found[0]]
+        if differ:
+            raise InputError(
+                f"rank {differ[0]} has other input than rank 0, or another version of clvoro: {found[differ[0]]:.300} "
+                f"in place of {found[0]:.300}; give all ranks the same arguments"
+            )
+        return cast("Made", made)
+
+    def fail(self, error: BaseException) -> None:
+        """Send the text of `error` to all other ranks."""
+        if self._failed:
+            return
+        self._failed = f"rank {self.number} of {self.count} has failed: {type(error).__name__}: {error}"
+        for part in range(self.count):
+            if part != self.number:
+                self._alarms.isend(self._failed, part, ALARM)
+
+
+def _bytes(values: np.ndarray) -> np.ndarray:
+    return values.reshape(-1).view(np.uint8)

@@ -1,0 +1,96 @@
+"""Which part owns which generators: runs of blocks of a Hilbert curve that all parts divide alike."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..geometry.domain import ClipBox
+from ..opencl.engine import Engine
+from ..opencl.peers import Peers
+
+BITS = 20
+"""Bits of a coordinate in the keys of the Hilbert curve."""
+BLOCKS = 1024
+"""A block has at most this share of the generators, unless many are at one place."""
+UNBALANCED = 1.1
+"""Generators of the largest part over the mean, from which on they are divided anew."""
+
+
+def hilbert_keys(points: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
+    """Return the places along a Hilbert curve of `points` (n, d) in the box between two corners, (n,) uint64.
+
+    The transformation is that of Skilling (2004), AIP Conf. Proc. 707, 381.
+    """
+    d, one = points.shape[1], np.uint64(1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        unit = np.nan_to_num((points - lower) / (upper - lower))
+    x = list(np.clip(unit * 2.0**BITS, 0, 2.0**BITS - 1).astype(np.uint64).T)
+    for bit in range(BITS - 1, 0, -1):
+        q, p = one << np.uint64(bit), (one << np.uint64(bit)) - one
+        for a in range(d):
+            flips = (x[a] & q) != 0
+            t = np.where(flips, 0, (x[0] ^ x[a]) & p)
+            x[0] = np.where(flips, x[0] ^ p, x[0] ^ t)
+            x[a] = x[a] ^ t if a else x[a]
+    for a in range(1, d):
+        x[a] = x[a] ^ x[a - 1]
+    t = np.zeros(len(points), np.uint64)
+    for bit in range(BITS - 1, 0, -1):
+        t = np.where(x[-1] & (one << np.uint64(bit)), t ^ ((one << np.uint64(bit)) - one), t)
+    keys = np.zeros(len(points), np.uint64)
+    for bit in range(BITS - 1, -1, -1):
+        for a in range(d):
+            keys = keys << one | (x[a] ^ t) >> np.uint64(bit) & one
+    return keys
+
+
+def divide(keys: np.ndarray, dim: int, peers: Peers) -> tuple[np.ndarray, np.ndarray]:
+    """Return the first keys of blocks of the curve, (b,) uint64, and how many generators all parts have in each.
+
+    Blocks depend on the generators alone, not on the number of parts. `keys` (n,) are those of this part.
+    """
+    keys = np.sort(keys)
+    firsts, spans = np.zeros(1, np.uint64), np.full(1, dim * BITS)
+    most = max(int(peers.total(len(keys))) // BLOCKS, 1)
+    while True:
+        begins = np.searchsorted(keys, firsts)
+        counts = peers.total(np.diff(np.append(begins, len(keys))))
+        full = (counts > most) & (spans > 0)
+        if not full.any():
+            return firsts, counts
+        step = np.where(full, spans - dim, 0).astype(np.uint64)[full]
+        children = firsts[full][:, None] + (np.arange(2**dim, dtype=np.uint64) << step[:, None])
+        levels = np.repeat(spans[full] - dim, 2**dim)
+        firsts, spans = np.concatenate([firsts[~full], children.ravel()]), np.concatenate([spans[~full], levels])
+        order = np.argsort(firsts, kind="stable")
+        firsts, spans = firsts[order], spans[order]
+
+
+def owners_of(counts: np.ndarray, parts: int) -> np.ndarray:
+    """Return the part of each block (b,), in runs of nearly equal numbers of generators. `counts` (b,) are theirs."""
+    middle = np.cumsum(counts) - counts / 2
+    return np.minimum(middle * parts / max(counts.sum(), 1), parts - 1).astype(int)
+
+
+def is_balanced(n: int, peers: Peers) -> bool:
+    """Return whether no part has many more generators than the mean; this one has `n`."""
+    sizes = np.array(peers.gather(np.array(n)))
+    return bool(sizes.max() <= UNBALANCED * sizes.mean() and sizes.min() > 0)
+
+
+def distribute(engine: Engine, box: ClipBox, rows: dict) -> dict:
+    """Return `rows`, device arrays of generators by name, with the generators that this part owns by their places.
+
+    ``rows["points"]`` are in the device's coordinates in `box`. All parts call this together.
+    """
+    peers = engine.peers
+    lower, upper = (corner[: engine.dim].astype(float) for corner in box.device_corners(engine.real))
+    keys = hilbert_keys(rows["points"].get().astype(float), lower, upper)
+    firsts, counts = divide(keys, engine.dim, peers)
+    to = owners_of(counts, peers.count)[np.searchsorted(firsts, keys, side="right") - 1]
+    made = {}
+    for name in list(rows):
+        values = rows.pop(name).get()
+        found = np.concatenate(peers.exchange([values[to == part] for part in range(peers.count)]))
+        made[name] = engine.upload(found, found.dtype)
+    return made

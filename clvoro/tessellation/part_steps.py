@@ -1,0 +1,286 @@
+"""The steps of a part of a domain: generators of other parts as ghosts, and the proof that there are enough of them.
+
+No generator lies in the ball around a corner of a cell that has the generator of the cell on its surface. All these
+balls of one cell lie in the ball around its generator of twice its reach, the distance of the farthest corner. So a
+cell is final if no other generator that this part does not know lies in that ball. Each part asks the owners of other
+generators, which it knows by boxes that contain them, for those in the balls of its cells. Where there are new ones,
+all parts make their cells again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pyopencl as cl
+import pyopencl.array as cla
+import scipy
+
+from ..geometry.domain import Domain
+from ..opencl.device_array import buffer_of
+from ..opencl.primitives import NamedArrays
+from .decomposition import hilbert_keys
+from .device_diagram import Follow, Tessellation
+from .part import Ghosts, Part
+from .stages import TessellationStages
+from .steps import DomainSteps, Sort
+
+FIRST_REACH = 2.5
+"""Radius of the first balls, in spacings of the generators around."""
+CHUNK, CHUNKS = 16, 512
+"""Least number of generators in a box, and largest number of boxes, that say where the generators of a part are."""
+SLACK = 1.05
+"""Factor on the radii of balls: with a few more ghosts the next diagrams need no further ones."""
+NOISE = {"float64": 1e-6, "float32": 1e-4}
+"""Bound of the round-off of a reach, as a share of it."""
+GROUP = 64
+"""Balls whose common box is looked at first."""
+
+
+class Chunks:
+    """Boxes around generators that follow one another on a Hilbert curve.
+
+    Parameters
+    ----------
+    points : (n, d) float
+    lower, upper : (d,) float
+        Corners of a box with all of them.
+
+    Attributes
+    ----------
+    order : (n,) int
+        Generators along the curve.
+    firsts : (k,) int
+        Where the chunks begin in `order`.
+    """
+
+    def __init__(self, points: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> None:
+        self.order = np.argsort(hilbert_keys(points, lower, upper), kind="stable")
+        count = max(1, min(CHUNKS, len(points) // CHUNK))
+        self.firsts = np.arange(count) * len(points) // count
+        self._least = float(np.prod(upper - lower) / len(points)) ** (1 / len(lower)) / CHUNK
+        self.move(points)
+
+    def move(self, points: np.ndarray) -> None:
+        """Set `boxes` (k, 2 d) to those of the present `points`: lower, then upper corners."""
+        sorted_points = points[self.order]
+        lower = np.minimum.reduceat(sorted_points, self.firsts, axis=0)
+        self.boxes = np.hstack([lower, np.maximum.reduceat(sorted_points, self.firsts, axis=0)])
+
+    def members(self, chunks: np.ndarray) -> np.ndarray:
+        """Return the generators of those `chunks` where it is True."""
+        return self.order[np.repeat(chunks, np.diff(np.append(self.firsts, len(self.order))))]
+
+    def spacings(self) -> np.ndarray:
+        """Return an estimate of the spacing at each generator, (n,)."""
+        dim, counts = self.boxes.shape[1] // 2, np.diff(np.append(self.firsts, len(self.order)))
+        wide = self.boxes[:, dim:] - self.boxes[:, :dim]
+        wide = np.maximum(wide, wide.max(axis=1, keepdims=True) / counts[:, None] ** (1 / dim))
+        found = np.empty(len(self.order))
+        found[self.order] = np.repeat((np.prod(wide, axis=1) / counts) ** (1 / dim), counts)
+        return np.maximum(found, self._least)
+
+
+def gaps2(points: np.ndarray, boxes: np.ndarray) -> np.ndarray:
+    """Return the squared distances of `points` (n, d) from `boxes` (k, 2 d), (n, k)."""
+    dim = points.shape[1]
+    below, above = boxes[None, :, :dim] - points[:, None], points[:, None] - boxes[None, :, dim:]
+    return (np.maximum(np.maximum(below, above), 0) ** 2).sum(axis=2)
+
+
+def overlaps(boxes: np.ndarray, others: np.ndarray) -> Any:
+    """Return which of `boxes` (k, 2 d) meets each of `others` (m, 2 d), (k, m) bool."""
+    dim = boxes.shape[1] // 2
+    low = boxes[:, None, :dim] <= others[None, :, dim:]
+    return (low & (others[None, :, :dim] <= boxes[:, None, dim:])).all(axis=2)
+
+
+class PartSteps(DomainSteps):
+    """The steps of one part of a domain whose other parts are the peers of the engine.
+
+    Ghosts are kept from one diagram of the same generators to the next.
+
+    Attributes
+    ----------
+    rounds : int
+        How often cells of the latest diagram were made.
+    """
+
+    def __init__(self, stages: TessellationStages, domain: Domain) -> None:
+        super().__init__(stages, domain)
+        self.peers, self.rounds = stages.engine.peers, 0
+        self._room = NamedArrays(stages.engine, spare=1 / 16)
+        self._labels: cla.Array | None = None
+
+    @property
+    def _reads_rows(self) -> bool:
+        """Whether rows of neighbors are read: in 2D by updates and the descent of shapes."""
+        return not self.stages.cells.from_previous
+
+    def begin(self, n: int, last: bool = False, labels: cla.Array | None = None) -> None:
+        """Note the labels of the generators, and count the rounds of a new diagram."""
+        assert labels is not None, "generators of parts have labels"
+        self._given, self.rounds = labels, 0
+
+    def extend(self, sites: cla.Array, n: int) -> Part:
+        """Return the generators, the first `n` of `sites`, with the ghosts that are known."""
+        labels = self._given
+        self.rounds += 1
+        if self.peers.count == 1:
+            return Part(n, n, sites, self.box, None, labels=labels)
+        x = sites[:n].get().astype(float)
+        if self._labels is not labels:
+            self._begin_anew(x, labels)
+        elif self.rounds == 1:
+            self._chunks.move(x)
+            self._meet()
+        self._x = x
+        count = n + len(self._rows)
+        points = self._room("points", size=count * self.stages.engine.dim).reshape(count, -1)
+        cl.enqueue_copy(self.stages.engine.queue, buffer_of(points), buffer_of(sites), byte_count=sites[:n].nbytes)
+        self._ghosts.fill(self.stages.engine, n, points)
+        return Part(n, count, points, self.box, self._ghosts, labels=self._all_labels)
+
+    def _begin_anew(self, x: np.ndarray, labels: cla.Array) -> None:
+        """Ask for ghosts around other generators than before."""
+        engine, count = self.stages.engine, self.peers.count
+        lower, upper = (corner[: engine.dim].astype(float) for corner in self.box.device_corners(engine.real))
+        self._labels, self._chunks = labels, Chunks(x, lower, upper)
+        self._sent = [np.empty(0, np.int32) for _ in range(count)]
+        self._parts, self._rows = np.empty(0, int), np.empty(0, np.int32)
+        self._caps = FIRST_REACH * self._chunks.spacings()
+        self._x = x
+        self._meet()
+        self._ask(x, self._caps, np.empty((0, engine.dim)), np.empty(0))
+        self._store()
+
+    def _meet(self) -> None:
+        """Tell the others where the generators are."""
+        self._boxes = self.peers.exchange([self._chunks.boxes] * self.peers.count)
+
+    def _store(self) -> None:
+        """Upload the lists of ghosts, and fetch what ghosts keep: labels, and how far their balls may reach."""
+        engine, n = self.stages.engine, len(self._x)
+        order = np.argsort(self._parts, kind="stable")
+        self._parts, self._rows = self._parts[order], self._rows[order]
+        sent = tuple(engine.upload(rows, np.int32) for rows in self._sent)
+        self._ghosts = Ghosts(engine.upload(self._rows, np.int32), peers=self.peers, parts=self._parts, sent=sent)
+        assert self._labels is not None
+        labels = np.empty(n + len(self._rows), np.int32)
+        labels[:n] = self._labels.get()[:n]
+        labels[n:] = np.concatenate(self.peers.exchange([labels[rows] for rows in self._sent]))
+        self._all_labels = engine.upload(labels, np.int32)
+        caps = self._caps[:n]
+        self._caps = np.concatenate([caps, *self.peers.exchange([caps[rows] for rows in self._sent])])
+
+    def builds_all(self, part: Part, complete: bool, enough: bool) -> bool:
+        """Return whether ghosts get cells: in 2D, where the descent of shapes reads the rows of neighbors."""
+        return part.ghosts is None or complete or self._reads_rows
+
+    def rows(self, previous: Tessellation) -> None:
+        """Cells start anew, since ghosts change."""
+
+    def is_complete(self, t: Tessellation) -> bool:
+        """Return whether ghosts have cells."""
+        return t.part is None or t.part.ghosts is None or t.whole is not None
+
+    def update(
+        self, sites: cla.Array, n: int, previous: Tessellation, sort: Sort, follow: Follow
+    ) -> Tessellation | None:
+        """Update `previous` in 2D, with the cells of ghosts; all parts do it, or none."""
+        stages = self.stages
+        if not self._reads_rows:
+            return None
+        self.rounds = 0
+        part = self.extend(sites, n)
+        before = previous.whole or previous
+        t = None if before is None else stages.update.update(stages.cells, self.box, part.points, before, clip=None)
+        if self.peers.any(t is None) or t is None:
+            return None
+        part.order_rows(stages.engine, t, stages.cells.defines)
+        made = self.finish(part, t, sites, False, True)
+        if made is not None:
+            follow(made, None)
+        return made
+
+    def finish(self, part: Part, t: Tessellation, points: cla.Array, exact: bool, nearest: bool) -> Tessellation | None:
+        """Return `t` if its cells, and in 2D those of neighbors, are final; None if there are more ghosts now."""
+        if part.ghosts is None:
+            return replace(t, part=part)
+        engine, n = self.stages.engine, part.n_own
+        assert t.reach is not None
+        reach = t.reach.get().astype(float) * (2 * (1 + NOISE[engine.real.name]))
+        ghosts = np.empty(0, int)
+        if self._reads_rows:
+            ghosts = part.neighboring_ghosts(engine, t)
+        away = part.points.get()[ghosts].astype(float)
+        while True:
+            caps = self._caps[: part.count]
+            radii = np.minimum(reach[:n], caps[:n]), np.minimum(reach[ghosts], caps[ghosts])
+            found = self._ask(self._x, radii[0], away, radii[1])
+            state = self.peers.total(
+                np.array([found, (reach[:n] > caps[:n]).any() or (reach[ghosts] > caps[ghosts]).any()])
+            )
+            if state[0]:
+                self._caps = 2 * caps
+                self._store()
+                return None
+            if not state[1]:
+                break
+            self._caps = 2 * caps
+        own = t.first(n) if t.n > n else t
+        whole = t if t.n == part.count else None
+        return replace(own, part=part, whole=whole, points=part.points, sites=part.points)
+
+    def _ask(self, x: np.ndarray, radii: np.ndarray, more: np.ndarray, more_radii: np.ndarray) -> int:
+        """Ask for the generators in balls around `x` (n, d) and `more` (k, d); return how many ghosts are new."""
+        balls = [self._near(boxes, x, radii, more, more_radii) for boxes in self._boxes]
+        balls[self.peers.number] = np.empty((0, x.shape[1] + 1))
+        wanted = self.peers.exchange(balls)
+        found = [self._inside(given, sent) for given, sent in zip(wanted, self._sent, strict=True)]
+        self._sent = [np.concatenate(pair) for pair in zip(self._sent, found, strict=True)]
+        new = self.peers.exchange(found)
+        self._parts = np.concatenate([self._parts, np.repeat(np.arange(len(new)), [len(rows) for rows in new])])
+        self._rows = np.concatenate([self._rows, *new])
+        return sum(map(len, new))
+
+    def _near(
+        self, boxes: np.ndarray, x: np.ndarray, radii: np.ndarray, more: np.ndarray, more_radii: np.ndarray
+    ) -> np.ndarray:
+        """Return the balls (m, d + 1) that meet one of the `boxes` (k, 2 d) of another part."""
+        chunks, dim = self._chunks, x.shape[1]
+        largest = np.maximum.reduceat(radii[chunks.order], chunks.firsts)[:, None]
+        grown = chunks.boxes + np.hstack([-largest] * dim + [largest] * dim)
+        meet = overlaps(grown, boxes)
+        ends, found = np.append(chunks.firsts, len(chunks.order)), []
+        for c in np.flatnonzero(meet.any(axis=1)):
+            rows = chunks.order[ends[c] : ends[c + 1]]
+            near = (gaps2(x[rows], boxes[meet[c]]) <= radii[rows, None] ** 2).any(axis=1)
+            found.append(rows[near])
+        rows = np.concatenate([np.empty(0, int), *found])
+        given = [np.column_stack([x[rows], SLACK * radii[rows]])]
+        for first in range(0, len(more), 4096):
+            places, reach = more[first : first + 4096], more_radii[first : first + 4096]
+            near = (gaps2(places, boxes) <= reach[:, None] ** 2).any(axis=1)
+            given.append(np.column_stack([places[near], SLACK * reach[near]]))
+        return np.concatenate(given)
+
+    def _inside(self, balls: np.ndarray, known: np.ndarray) -> np.ndarray:
+        """Return the generators in `balls` (m, d + 1) that are not among the `known` ones, (k,) int32."""
+        if not len(balls):
+            return np.empty(0, np.int32)
+        centers, radii = balls[:, :-1], balls[:, -1:]
+        firsts = np.arange(0, len(balls), GROUP)
+        lower = np.minimum.reduceat(centers - radii, firsts, axis=0)
+        groups = np.hstack([lower, np.maximum.reduceat(centers + radii, firsts, axis=0)])
+        rows = self._chunks.members(overlaps(self._chunks.boxes, groups).any(axis=1))
+        rows = np.setdiff1d(rows, known)
+        if not len(rows):
+            return np.empty(0, np.int32)
+        lists: Sequence = scipy.spatial.cKDTree(self._x[rows]).query_ball_point(
+            centers, radii[:, 0], return_sorted=False
+        )
+        places = np.unique(np.concatenate([np.asarray(some, int) for some in lists]))
+        return rows[places].astype(np.int32)

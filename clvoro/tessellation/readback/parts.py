@@ -1,0 +1,99 @@
+"""Read the diagram of a part, its own cells with walls towards the others, and that of all parts from their rows."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pyopencl.array as cla
+
+from ...geometry.domain import Domain
+from ...mesh.diagram import Diagram
+from ...mesh.subset import take_subset
+from ...opencl.engine import Engine
+from ...opencl.peers import Peers
+from ..device_diagram import Tessellation
+from .diagram import fetch_diagram, order_of, starts_of
+
+
+def fetch_part(engine: Engine, domain: Domain, t: Tessellation, labels: cla.Array) -> Diagram:
+    """Return the cells of a part in the order of `labels` (n,). Faces towards cells of part k are walls ``"rankK"``."""
+    if t.part is None or t.part.ghosts is None or t.whole is None:
+        return fetch_diagram(engine, domain, t, labels, copy=False)
+    order = order_of(labels.get())
+    places = np.arange(t.whole.n, dtype=np.int32)
+    places[order] = np.arange(t.n)
+    diagram = fetch_diagram(engine, domain, t.whole, engine.upload(places, np.int32), copy=False)
+    names = np.full(t.whole.n, "", object)
+    names[t.n :] = [f"rank{part}" for part in t.part.ghosts.parts]
+    return take_subset(diagram, np.arange(t.whole.n) < t.n, names)
+
+
+@dataclass(frozen=True)
+class CellRows:
+    """The cells of a part on the host, as the device has them; neighbors are labels.
+
+    Attributes
+    ----------
+    labels : (n,) int32
+    counts : (n,) int32
+        Number of faces.
+    cells : tuple of (n, ...) arrays
+        Points, volumes, offsets and covariances.
+    faces : tuple of (m, ...) arrays
+        Labels of neighbors, walls being negative; measures and centroids.
+    round_off : int
+    """
+
+    labels: np.ndarray
+    counts: np.ndarray
+    cells: tuple[np.ndarray, ...]
+    faces: tuple[np.ndarray, ...]
+    round_off: int
+
+    @classmethod
+    def of(cls, t: Tessellation, labels: cla.Array) -> CellRows:
+        """Return those of `t`, whose generators have `labels` (n,)."""
+        own, starts, n = labels.get()[: t.n], t.starts.get(), t.n
+        names = own if t.part is None or t.part.labels is None else t.part.labels.get()
+        rows = t.neighbors.get()[: starts[n]]
+        faces = (
+            np.where(rows < 0, rows, names[np.maximum(rows, 0)]),
+            *(array.get()[: starts[n]] for array in (t.face_measures, t.face_centroids)),
+        )
+        cells = tuple(array.get()[:n] for array in (t.points, t.volumes, t.offsets, t.covariances))
+        return cls(own, np.diff(starts).astype(np.int32), cells, faces, t.round_off)
+
+    def gather(self, peers: Peers) -> CellRows | None:
+        """Return the cells of all parts on part 0, in the order of labels; None on the others."""
+        given = self.labels, self.counts, *self.cells, *self.faces
+        found = [peers.collect(array) for array in given]
+        round_off = np.bitwise_or.reduce(peers.gather(np.array(self.round_off)))
+        if peers.number:
+            return None
+        labels, counts, *rest = (np.concatenate(arrays) for arrays in found)
+        order, starts = np.argsort(labels, kind="stable"), starts_of(counts)
+        counts = counts[order]
+        places = np.repeat(starts[:-1][order] - starts_of(counts)[:-1], counts) + np.arange(counts.sum())
+        cells = tuple(array[order] for array in rest[: len(self.cells)])
+        faces = tuple(array[places] for array in rest[len(self.cells) :])
+        return CellRows(labels[order], counts, cells, faces, int(round_off))
+
+    def diagram(self, engine: Engine, domain: Domain) -> Diagram:
+        """Return the diagram of cells in the order of labels that are all of the domain."""
+        neighbors, measures, centroids = self.faces
+        rows = np.where(neighbors < 0, neighbors, np.searchsorted(self.labels, neighbors))
+        points, volumes, offsets, covariances = (engine.upload(array, array.dtype) for array in self.cells)
+        t = Tessellation(
+            len(self.labels),
+            points,
+            engine.upload(starts_of(self.counts), np.int32),
+            engine.upload(rows, np.int32),
+            engine.upload(measures, measures.dtype),
+            engine.upload(centroids, centroids.dtype),
+            volumes,
+            offsets,
+            covariances,
+            round_off=self.round_off,
+        )
+        return fetch_diagram(engine, domain, t, engine.upload(np.arange(t.n), np.int32), copy=False)

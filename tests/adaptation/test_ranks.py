@@ -1,0 +1,121 @@
+"""Runs that parts of a domain share: in threads, and over the ranks of MPI."""
+
+import importlib.util
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import clvoro
+from clvoro.errors import InputError, InputTypeError
+from tests.reference.peers import run_parts
+
+ARRAYS = ("points", "volumes", "centroids", "neighbor_starts", "neighbors", "face_measures", "face_centroids")
+SCRIPT = """
+import clvoro, sys
+from mpi4py import MPI
+
+adapter = clvoro.Adapter(comm=MPI.COMM_WORLD)
+for dim in (2, 3):
+    box = clvoro.Box((0,) * dim, (1,) * dim)
+    mesh = adapter.run(box, lambda p: (0.06 if dim == 2 else 0.12) * (1 + p[:, 0]), effort="fast")
+    whole = mesh.gather()
+    assert (whole is None) == (MPI.COMM_WORLD.rank > 0)
+    if whole is not None:
+        assert whole.check(), whole.check()
+        print(len(whole), len(mesh), whole.history["cells"][-1])
+"""
+
+
+def run_in(parts, ctx, *given, dtype="float64", **options):
+    """Return the results of `parts` threads, each with an adapter, and the whole mesh."""
+
+    def work(peers):
+        adapter = clvoro.Adapter(ctx, dtype)
+        adapter._peers = peers
+        mesh = adapter.run(*given, **options)
+        return mesh, mesh.gather()
+
+    found = run_parts(parts, work)
+    assert all(whole is None for _, whole in found[1:])
+    return [mesh for mesh, _ in found], found[0][1]
+
+
+def ramp(h):
+    return lambda p: h * (1 + 2 * p[:, 0])
+
+
+@pytest.mark.sparse(2)
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+@pytest.mark.parametrize("dim", [2, 3])
+def test_the_diagram_has_the_same_bits_in_any_number_of_parts(ctx, dim, dtype):
+    """Clusters of very different density, so that balls reach far: ghosts are enough, or bits differ."""
+    rng = np.random.default_rng(70101)
+    x = np.concatenate([rng.random((150, dim)), 0.3 + 0.02 * rng.standard_normal((150, dim))])
+    given = clvoro.Box((0,) * dim, (1,) * dim), 0.1
+    options = {"points": x.astype(dtype), "method": "lloyd", "max_steps": 0, "dtype": dtype}
+    meshes = [run_in(parts, ctx, *given, **options)[1] for parts in (1, 2, 4)]
+    plain = clvoro.Adapter(ctx, dtype).diagram(given[0], options["points"])
+    assert np.allclose(meshes[0].volumes, plain.volumes, rtol=1e-3 if dtype == "float32" else 1e-9)
+    for mesh in meshes[1:]:
+        for name in ARRAYS:
+            assert np.array_equal(getattr(mesh, name), getattr(meshes[0], name)), name
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_a_run_in_parts(ctx, dim):
+    """Each part has its own cells, in balance; the whole has the sizes and shapes of a run without parts."""
+    given = clvoro.Box((0,) * dim, (1,) * dim), ramp(0.05 if dim == 2 else 0.1)
+    alone = clvoro.Adapter(ctx).run(*given, effort="fast")
+    meshes, whole = run_in(3, ctx, *given, effort="fast")
+    assert whole.check()
+    sizes = [len(mesh) for mesh in meshes]
+    assert sum(sizes) == len(whole)
+    assert max(sizes) < 1.15 * len(whole) / 3
+    assert abs(len(whole) / len(alone) - 1) < 0.03
+    for name in ("mean_error", "mean_quality"):
+        one, other = alone.history[name][-1], whole.history[name][-1]
+        assert abs(one - other) < (0.3 * one if name == "mean_error" else 0.01)
+    for number, mesh in enumerate(meshes):
+        assert np.isin(mesh.parts.labels, np.concatenate([m.parts.labels for m in meshes])).all()
+        names = set(mesh.domain.boundary_names)
+        assert {f"rank{k}" for k in range(3) if k != number} & names
+        assert f"rank{number}" not in names
+        rows = np.searchsorted(np.sort(np.concatenate([m.parts.labels for m in meshes])), mesh.parts.labels)
+        for array in ("points", "volumes", "size_error", "quality"):
+            assert np.array_equal(getattr(mesh, array), getattr(whole, array)[rows])
+
+
+@pytest.mark.parametrize("change", [{"method": "transport"}, {"fixed": [(0.5, 0.5)]}, {"checkpoint": "run.npz"}])
+def test_what_ranks_cannot_share_is_refused(ctx, change):
+    with pytest.raises(InputError, match="ranks share the run"):
+        run_in(1, ctx, clvoro.Box((0, 0), (1, 1)), 0.2, **change)
+    with pytest.raises(InputTypeError, match="communicator"):
+        clvoro.Adapter(ctx, comm=4)
+
+
+def test_parts_with_other_input_are_refused(ctx):
+    def work(peers):
+        adapter = clvoro.Adapter(ctx)
+        adapter._peers = peers
+        adapter.run(clvoro.Box((0, 0), (1, 1)), 0.2 - 0.1 * peers.number)
+
+    with pytest.raises(InputError, match="rank 1 has other input than rank 0"):
+        run_parts(2, work)
+
+
+@pytest.mark.skipif(importlib.util.find_spec("mpi4py") is None, reason="mpi4py is not installed")
+def test_a_script_under_mpiexec(tmp_path):
+    script = tmp_path / "script.py"
+    script.write_text(SCRIPT)
+    mpiexec = Path(sys.executable).parent / "mpiexec"
+    environment = {**os.environ, "POCL_MAX_PTHREAD_COUNT": "1", "PYTHONPATH": str(Path(clvoro.__file__).parents[1])}
+    command = [str(mpiexec if mpiexec.exists() else "mpiexec"), "-n", "2", sys.executable, str(script)]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=240)
+    assert done.returncode == 0, done.stderr[-3000:]
+    for line in done.stdout.splitlines():
+        cells, own, recorded = map(int, line.split())
+        assert cells == recorded > own > cells / 3
