@@ -1010,6 +1010,9 @@ TESTED_IN = {
     "prisms, which need": "finite_volumes/test_prism_layers.py::test_prisms_that_memory_does_not_hold_are_refused",
     "points in the layers, expected": "finite_volumes/test_prism_layers.py::test_points_in_layers_only_are_refused",
     "; use fewer layers": "finite_volumes/test_prism_layers.py::test_wrong_layers_are_refused",
+    "expected a communicator of mpi4py": "adaptation/test_ranks.py::test_what_ranks_cannot_share_is_refused",
+    "since ranks share the run": "adaptation/test_ranks.py::test_what_ranks_cannot_share_is_refused",
+    "has other input than rank 0": "adaptation/test_ranks.py::test_parts_with_other_input_are_refused",
     "cells meet at a vertex": "tessellation/test_vertices.py::test_walks_around_a_vertex_end",
 }
 """Parts of texts of errors without a row, and the tests that raise them."""
