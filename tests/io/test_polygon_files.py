@@ -274,29 +274,6 @@ def test_npz_keeps_everything(ctx, tmp_path, name: str) -> None:
     assert (tmp_path / "mesh.npz").read_bytes() == (tmp_path / "twice.npz").read_bytes()
 
 
-@pytest.mark.parametrize(
-    ("name", "change", "says"),
-    [
-        ("diagram.neighbors", lambda j: np.where(j == -1, -17, j), "neighbors has an index out of"),
-        ("diagram.face_vertex_starts", lambda s: s // 2 * 3, "face_vertex_starts does not divide"),
-        ("diagram.face_vertices", lambda v: v + 10_000, "face_vertices has an index out of"),
-        ("diagram.face_vertices", None, "lacks diagram.face_vertices"),
-    ],
-)
-def test_damaged_npz_is_refused(result, tmp_path, name: str, change, says: str) -> None:
-    path = tmp_path / "mesh.npz"
-    result.save(path)
-    with np.load(path) as archive:
-        arrays = dict(archive)
-    if change is None:
-        del arrays[name]
-    else:
-        arrays[name] = change(arrays[name]).astype(arrays[name].dtype)
-    np.savez(path, **arrays)
-    with pytest.raises(InputError, match=says):
-        clvoro.load(path)
-
-
 @pytest.mark.sparse(2)
 @pytest.mark.parametrize("name", list(DOMAINS))
 def test_vtu_is_read_back(ctx, tmp_path, name: str) -> None:
@@ -566,51 +543,3 @@ def test_overlaps_sum_to_the_cells(pair) -> None:
     # Round-off of areas of numbers up to 4; the rest of the mass is distributed over all cells.
     assert np.abs(got * new.volumes[:, None] - expected).max() < 1e-13
     assert (expected > 0).sum() > 60
-
-
-@pytest.mark.sparse(2)
-@pytest.mark.parametrize("name", list(DOMAINS))
-def test_transfer_is_conservative_and_exact(ctx, name: str) -> None:
-    domain = DOMAINS[name]()
-    adapter = clvoro.Adapter(ctx)
-    old, new = (adapter.diagram(domain, scattered(domain, n, n)) for n in (300, 170))
-
-    def linear(d):
-        return 1 + 2 * d.centroids[:, 0] - 3 * d.centroids[:, 1]
-
-    rough = np.random.default_rng(7).standard_normal(300)
-    for order, limited in ((1, True), (2, True), (2, False)):
-        got = old.transfer(np.column_stack([rough, linear(old), np.full(300, np.pi)]), new, order, limited=limited)
-        assert got.shape == (170, 3)
-        for values, column in zip((rough, linear(old)), got.T, strict=False):
-            mass = np.abs(old.volumes * values).sum()
-            assert abs(new.volumes @ column - old.volumes @ values) < 1e-12 * mass
-        assert np.abs(got[:, 2] - np.pi).max() < 1e-14
-        if limited:
-            assert (got[:, 2] == np.pi).all()
-            assert got[:, 0].min() >= rough.min()
-            assert got[:, 0].max() <= rough.max()
-    # Exact where every overlapped old cell has neighbors in two directions: nearly everywhere.
-    error = np.abs(got[:, 1] - linear(new))
-    assert np.median(error) < 1e-14
-    assert name == "comb" or error.max() < 1e-13
-
-
-def test_transfer_onto_itself_changes_nothing(pair) -> None:
-    values = np.random.default_rng(3).random(60)
-    assert np.abs(pair[0].transfer(values, pair[0]) - values).max() < 1e-13
-
-
-def test_slopes_are_those_of_a_box(ctx) -> None:
-    # A box as a polygon.
-    box, points = clvoro.Box((0, 0), (1, 1)), np.random.default_rng(9).random((80, 2))
-    values = np.random.default_rng(10).standard_normal((80, 1))
-    adapter = clvoro.Adapter(ctx)
-    new = np.random.default_rng(11).random((70, 2))
-    for limited in (True, False):
-        flat, ring_ = (
-            adapter.diagram(domain, points).transfer(values, adapter.diagram(domain, new), 2, limited=limited)
-            for domain in (box, Polygon(SQUARE))
-        )
-        # Round-off grows where the fit is ill-conditioned, as for neighbors nearly on a line.
-        assert np.abs(flat - ring_).max() < 1e-10

@@ -9,7 +9,7 @@ import pytest
 import clvoro
 from clvoro.errors import InputError
 from clvoro.mesh.diagram import Diagram
-from tests.reference.globes import CASES, EARTH, arcs, is_double, made, scattered
+from tests.reference.globes import CASES, arcs, is_double, made, scattered
 from tests.reference.netcdf_files import random_points, read
 
 
@@ -113,45 +113,6 @@ def same_arrays(one, other, names=None):
         assert np.array_equal(getattr(one, name), getattr(other, name)), name
 
 
-def test_npz_of_a_run_keeps_everything(ctx, tmp_path):
-    run = clvoro.Adapter(ctx).run(EARTH, 1.0, n_cells=200, effort="fast")
-    run.save(tmp_path / "mesh.npz")
-    again = clvoro.load(tmp_path / "mesh.npz")
-    assert again.diagram.domain == EARTH
-    same_arrays(run.diagram, again.diagram)
-    for name in ("points", "target_size", "size_error", "quality", "history"):
-        assert np.array_equal(getattr(run, name), getattr(again, name)), name
-    assert (again.converged, again.stop_reason) == (run.converged, run.stop_reason)
-
-
-def damaged(path, **changes):
-    """Write the members of an npz file again, some of them changed."""
-    with np.load(path) as file:
-        members = {name: file[name] for name in file.files}
-    for name, change in changes.items():
-        name = name.replace("__", ".")
-        members[name] = change(members[name])
-    np.savez(path, **members)
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"about": lambda a: np.array(a.item().replace('"radius": 1.0', '"radius": -1'))}, "radius"),
-        ({"about": lambda a: np.array(a.item().replace('"radius": 1.0', '"radius": "x"'))}, "radius"),
-        ({"diagram__neighbors": lambda a: np.where(np.arange(len(a)) == 3, -1, a)}, "out of range"),
-        ({"diagram__points": lambda a: a[:, :2]}, "centroids has shape"),
-        ({"diagram__cell_vertices": lambda a: a + 10**6}, "out of range"),
-    ],
-)
-def test_damaged_npz_is_refused(ctx, tmp_path, changes, message):
-    diagram = clvoro.Adapter(ctx).diagram(clvoro.Sphere(1), scattered(150))
-    diagram.save(tmp_path / "mesh.npz")
-    damaged(tmp_path / "mesh.npz", **changes)
-    with pytest.raises(InputError, match=message):
-        clvoro.load(tmp_path / "mesh.npz")
-
-
 @pytest.mark.sparse(2)
 def test_vtu_reads_back(result, tmp_path):
     for mesh in (result, result.diagram):
@@ -197,27 +158,6 @@ def test_vtu_with_a_hole_is_refused(ctx, tmp_path):
     Diagram(d.domain, arrays).save(tmp_path / "mesh.vtu")
     with pytest.raises(InputError, match="has a face that is no other cell's"):
         clvoro.load(tmp_path / "mesh.vtu")
-
-
-def test_vtu_as_meshio_reads_it(result, tmp_path, meshio_for_vtu):
-    result.save(tmp_path / "mesh.vtu")
-    mesh = meshio_for_vtu.read(tmp_path / "mesh.vtu")
-    assert np.array_equal(mesh.points, result.diagram.vertices)
-    assert sum(len(block.data) for block in mesh.cells) == len(result.points)
-
-
-@pytest.mark.parametrize("suffix", [".vtk", ".ply", ".obj"])
-def test_formats_through_meshio_keep_every_polygon(ctx, tmp_path, suffix):
-    meshio = pytest.importorskip("meshio")
-    diagram = clvoro.Adapter(ctx).diagram(EARTH, scattered(150))
-    diagram.save(tmp_path / f"mesh{suffix}")
-    if suffix == ".obj":  # meshio reads triangles only
-        lines = (tmp_path / "mesh.obj").read_text().split("\n")
-        assert sum(line.startswith("f ") for line in lines) == len(diagram)
-        return
-    mesh = meshio.read(tmp_path / f"mesh{suffix}")
-    np.testing.assert_allclose(mesh.points, diagram.vertices, rtol=1e-6)
-    assert sum(len(block.data) for block in mesh.cells) == len(diagram)
 
 
 # --- METIS ---

@@ -251,22 +251,6 @@ def test_refined_icosahedra(adapter, levels, order):
         np.testing.assert_allclose(got[: len(old)], q, rtol=0, atol=1e-12)
 
 
-def test_size_ratio_of_a_million(adapter):
-    """One mesh has a cluster of 1e-6 of the radius: a cell overlaps thousands, or lies within one."""
-    rng = np.random.default_rng(191)
-    wide = random_points(60, 3)
-    cluster = UNIT.wrap(wide[0] + 1e-6 * (rng.random((1500, 3)) - 0.5))
-    one = adapter.diagram(UNIT, np.vstack([wide[1:], cluster]))
-    other = adapter.diagram(UNIT, random_points(70, 4))
-    for old, new in ((one, other), (other, one)):
-        q = rng.normal(size=len(old))
-        for order in (1, 2):
-            got = old.transfer(q, new, order, adapter=adapter)
-            assert mass_defect(old, new, q, got) < 1e-13
-            assert got.min() >= q.min()
-            assert got.max() <= q.max()
-
-
 def test_small_cells_keep_their_digits(adapter):
     """In a cap of 1e-4 linear functions are linear to 1e-8 of their range, if areas and centroids are precise."""
     rng = np.random.default_rng(23)
@@ -285,41 +269,6 @@ def test_small_cells_keep_their_digits(adapter):
     np.testing.assert_allclose(got[inner], exact[inner], rtol=0, atol=1e-12)
 
 
-@pytest.mark.sparse(1)
-@ORDERS
-def test_transfer_to_refined_mesh_and_back(mesh, adapter, order):
-    old = mesh(150, 3037)
-    rng = np.random.default_rng(45)
-    near = old.points.repeat(20, axis=0) + 1e-3 * rng.normal(size=(3000, 3))
-    new = adapter.diagram(UNIT, np.vstack([old.points, near]))
-    q = rng.normal(size=150)
-    there = old.transfer(q, new, order, adapter=adapter)
-    back = new.transfer(there, old, order, adapter=adapter)
-    assert mass_defect(old, new, q, there) < 1e-13
-    assert mass_defect(old, old, q, back) < 1e-13
-    assert np.abs(back - q).mean() < 0.5 * np.abs(q).mean()
-
-
-def test_repeats_bit_for_bit_and_needs_no_adapter(mesh):
-    old, new = mesh(300, 21), mesh(400, 22)
-    q = np.random.default_rng(5).normal(size=(300, 2))
-    once = old.transfer(q, new, 2)
-    np.testing.assert_array_equal(old.transfer(q, new, 2), once)
-    np.testing.assert_array_equal(old.transfer(q[:, 1], new, 2), once[:, 1])
-
-
-@pytest.mark.slow
-def test_results_in_single_precision(ctx):
-    single = clvoro.Adapter(ctx, dtype="float32")
-    earth = Sphere()
-    runs = [single.run(earth, 1.0, n_cells=n, seed=61, max_steps=5) for n in (700, 900)]
-    q = np.sin(7 * runs[0].diagram.centroids[:, 0] / earth.radius)
-    got = runs[0].transfer(q, onto=runs[1], order=2)
-    assert mass_defect(runs[0].diagram, runs[1].diagram, q, got) < 1e-12
-    assert got.min() >= q.min()
-    assert got.max() <= q.max()
-
-
 def test_other_domains_are_rejected(mesh, adapter):
     old, plane = mesh(9, 1), adapter.diagram(clvoro.Box((0, 0), (1, 1)), [[0.5, 0.5]])
     with pytest.raises(InputError, match=r"Sphere\(radius=2.0\), .* Sphere\(radius=1.0\); expected one radius"):
@@ -328,19 +277,6 @@ def test_other_domains_are_rejected(mesh, adapter):
         old.transfer(np.ones(9), plane)
     with pytest.raises(InputError, match=r"onto is a mesh of Sphere.* are on Box.*expected meshes in one space"):
         plane.transfer(np.ones(1), old)
-
-
-def test_bad_values_are_rejected(mesh):
-    old, new = mesh(9, 1), mesh(8, 2)
-    with pytest.raises(InputError, match=r"shape \(8,\), expected \(9,\) or \(9, k\)"):
-        old.transfer(np.ones(8), new)
-    with pytest.raises(InputError, match=r"values\.T"):
-        old.transfer(np.ones((2, 9)), new)
-    with pytest.raises(InputError, match=r"values\[3\] is nan"):
-        old.transfer(np.where(np.arange(9) == 3, np.nan, 1), new)
-    with pytest.raises(InputError, match="order is 3, expected 1 or 2"):
-        old.transfer(np.ones(9), new, 3)
-    assert old.transfer(np.ones((9, 0)), new).shape == (8, 0)
 
 
 NAMES = ("volumes", "centroids", "neighbor_starts", "neighbors", "vertices", "cell_vertex_starts", "cell_vertices")
