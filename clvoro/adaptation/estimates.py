@@ -12,8 +12,7 @@ from ..errors import MemoryLimitError
 from ..geometry.domain import Domain
 from ..opencl import memory_limits
 from ..opencl.engine import Engine
-from ..opencl.host_memory import host_memory
-from ..opencl.memory_limits import available_memory, in_bytes
+from ..opencl.memory_limits import available_memory, host_memory, in_bytes
 from ..opencl.workspace import KEPT
 from ..tessellation.cut_cells import clipping_space
 from .sampling.quadrature import DensityTree

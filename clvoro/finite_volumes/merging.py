@@ -11,11 +11,10 @@ from functools import cached_property
 
 import numpy as np
 
-from ..mesh.connectivity import distinct, take_ranges, take_rows
+from ..mesh.connectivity import distinct, independent, take_ranges, take_rows
 from ..mesh.diagram import Diagram
 from ..mesh.geometry import lengths, loop_geometry, sum_columns
 from .defects import DefectLimits, Defects, find_defects
-from .independent import independent
 from .neighborhood import Neighborhood
 from .seams import unpack
 

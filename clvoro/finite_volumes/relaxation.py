@@ -6,10 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..mesh.connectivity import following, inverse, take_rows
+from ..mesh.connectivity import following, independent, inverse, take_rows
 from ..mesh.faces import Faces
 from ..mesh.geometry import smaller_size, turns
-from .independent import independent
 from .measures import PlaneMeasures
 from .prisms import simple_loops
 from .short_edges import CORNER, STRAIGHT, WALL, point_kinds

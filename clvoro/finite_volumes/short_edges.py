@@ -8,11 +8,10 @@ from functools import cached_property
 import numpy as np
 
 from ..geometry.rings import WALL_CORNER
-from ..mesh.connectivity import following, take_rows
+from ..mesh.connectivity import following, independent, take_rows
 from ..mesh.faces import Faces
 from ..mesh.geometry import polygon_areas, smaller_size, turns
 from ..mesh.straightening import cross
-from .independent import independent
 from .measures import PlaneMeasures
 from .prisms import simple_loops
 

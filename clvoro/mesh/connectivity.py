@@ -64,3 +64,29 @@ def take_ranges(
 def slices(count: int, size: int = 1 << 14) -> Iterator[slice]:
     """Cut `count` rows into parts whose arrays fit the caches: large arrays cost a system call and cleared memory."""
     return (slice(k, min(k + size, count)) for k in range(0, count, size))
+
+
+def independent(sets: np.ndarray, cells: np.ndarray, priority: np.ndarray, n: int) -> np.ndarray:
+    """Return a maximal choice of sets without a cell in common, those of least priority first, (k,) bool.
+
+    Sets are changes to a mesh, with the `cells` (s,) that they change; the choice can be made at the same time.
+    """
+    k = len(priority)
+    rank = np.empty(k, np.int64)
+    rank[np.argsort(priority, kind="stable")] = np.arange(k)
+    chosen, left = np.zeros(k, bool), np.ones(k, bool)
+    taken = np.zeros(n, bool)
+    while len(sets):
+        best = np.full(n, k)
+        np.minimum.at(best, cells, rank[sets])
+        loses = np.zeros(k, bool)
+        loses[sets[best[cells] != rank[sets]]] = True
+        wins = left & ~loses
+        wins &= np.bincount(sets, minlength=k) > 0
+        chosen |= wins
+        taken[cells[wins[sets]]] = True
+        left &= ~wins
+        left[sets[taken[cells]]] = False
+        going = left[sets]
+        sets, cells = sets[going], cells[going]
+    return chosen

@@ -1,11 +1,19 @@
-"""Limits of a device's memory: of all arrays, and of one."""
+"""Limits of memory: of a device, for all arrays and for one, and of this process on the host."""
 
 from __future__ import annotations
+
+import contextlib
+import math
+import os
+from collections.abc import Iterator
+from pathlib import Path
 
 import pyopencl as cl
 
 from ..errors import MemoryLimitError
-from .host_memory import host_memory
+
+GROUPS, OWN_GROUPS = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
+"""Linux's files with the limits of control groups, and with those of this process."""
 
 
 def in_bytes(amount: float) -> str:
@@ -39,3 +47,37 @@ def check_allocation(device: cl.Device, size: int) -> None:
             f"an array needs {in_bytes(size)}, and {device.name.strip()} allocates at most {in_bytes(most)} for one; "
             "use a larger size, n_cells, dtype='float32' or another device"
         )
+
+
+def _group_limits() -> Iterator[float]:
+    """Yield the limits of this process's control groups, as containers and batch systems set them."""
+    paths = {(GROUPS, "memory.max", "."), (GROUPS / "memory", "memory.limit_in_bytes", ".")}
+    with contextlib.suppress(ValueError, OSError):  # another format, or no such file
+        for line in OWN_GROUPS.read_text().splitlines():
+            _, kinds, path = line.split(":", 2)
+            if not kinds:
+                paths.add((GROUPS, "memory.max", path.strip("/")))
+            elif "memory" in kinds.split(","):
+                paths.add((GROUPS / "memory", "memory.limit_in_bytes", path.strip("/")))
+    for root, name, path in paths:
+        for group in (Path(path), *Path(path).parents):
+            with contextlib.suppress(ValueError, OSError):  # "max", or no such file
+                yield int((root / group / name).read_text())
+
+
+def host_memory() -> float:
+    """Return the memory of the machine, or the limit of a container, a batch system or the shell (ulimit -v), in bytes.
+
+    Infinite if the system gives none.
+    """
+    limits = [math.inf]
+    with contextlib.suppress(AttributeError, ValueError, OSError):  # systems other than POSIX
+        limits.append(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
+    limits += _group_limits()
+    with contextlib.suppress(ImportError, ValueError, OSError):
+        import resource
+
+        limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+        if limit != resource.RLIM_INFINITY:
+            limits.append(limit)
+    return min(limit for limit in limits if limit > 0)

@@ -12,7 +12,7 @@ import numpy as np
 from ..errors import InputError, InputTypeError, MemoryLimitError
 from ..geometry.domain import Domain
 from ..opencl.engine import PLAIN, Engine, Traits
-from ..opencl.host_memory import host_memory
+from ..opencl.memory_limits import host_memory
 from .arguments import check_slope, coverage_warnings
 from .field import Field, as_field, count_parts, on_domain
 from .raster import Raster

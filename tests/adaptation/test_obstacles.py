@@ -6,7 +6,7 @@ import shapely
 
 import clvoro
 from clvoro.cli.cases import Case
-from clvoro.cli.cases.toml import write
+from clvoro.cli.cases.files import write_toml
 from clvoro.errors import InputError, InputTypeError
 
 TUBE, WEDGE = clvoro.curves.circle((0, 0), 0.2), [(0.8, 0.35), (1.3, 0.5), (0.8, 0.65)]
@@ -83,7 +83,7 @@ def test_holes_in_a_case():
     text += "[size]\nkind = 'constant'\nvalue = 0.1\n"
     case = Case.from_toml(text, "my.toml")
     wanted = BOTH.without([TUBE, [(0.8, 0.4), (1.3, 0.5), (0.8, 0.6)]])
-    for one in (case, Case.from_toml(write(case.table), "my.toml")):
+    for one in (case, Case.from_toml(write_toml(case.table), "my.toml")):
         assert one.domain.holes.describe() == wanted.holes.describe()
         assert one.domain.holes.parts.names == ("tube", "hole-2")
 

@@ -70,7 +70,7 @@ def test_curves_as_rings() -> None:
     wanted = clvoro.Polygon(c.circle((1, 2), 3, name="far"), holes)
     assert case.domain == wanted
     assert case.domain.boundary_names == ("far", "hole-1", "hole-2", "hole-3")
-    again = Case.from_toml(clvoro.cli.cases.toml.write(case.table), "case.toml")
+    again = Case.from_toml(clvoro.cli.cases.files.write_toml(case.table), "case.toml")
     assert again.domain == wanted
 
 

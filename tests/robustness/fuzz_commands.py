@@ -12,7 +12,8 @@ import numpy as np
 import clvoro
 from clvoro.adaptation.checkpoint import Saved
 from clvoro.cli import command as cli
-from clvoro.cli.cases import Case, toml
+from clvoro.cli.cases import Case
+from clvoro.cli.cases.files import write_toml
 from clvoro.cli.jobs import Job
 from clvoro.errors import InputError
 from clvoro.io.vtu_read import load_vtu
@@ -28,7 +29,7 @@ def try_case(rng: np.random.Generator) -> str:
     """A valid or invalid case file, from the text to the written files."""
     with tempfile.TemporaryDirectory() as folder:
         wild = rng.random() < WILD
-        text = toml.write(some_case(rng, Path(folder), some_real(rng), wild))
+        text = write_toml(some_case(rng, Path(folder), some_real(rng), wild))
         case = Case.from_toml(text, "fuzz.toml", Path(folder))
         out = Path(folder) / "out"
         with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
@@ -48,7 +49,7 @@ def try_command(rng: np.random.Generator) -> str:
         folder, real = Path(name), some_real(rng)
         wild = rng.random() < WILD
         case = some_case(rng, folder, real, wild and bool(rng.integers(2)))
-        (folder / "c.toml").write_text(toml.write(case))
+        (folder / "c.toml").write_text(write_toml(case))
         settings = case.get("run")
         several = isinstance(settings, dict) and "methods" in settings
         run = ["run", str(folder / "c.toml"), "--out", str(folder / "out")]

@@ -32,7 +32,7 @@ from clvoro.errors import (
     OutputError,
 )
 from clvoro.io import npz
-from clvoro.opencl import host_memory as _host_memory
+from clvoro.opencl import memory_limits
 from clvoro.opencl import runtimes as _runtimes
 from clvoro.opencl.kernels import KernelPool, Kernels
 from clvoro.opencl.memory_limits import in_bytes
@@ -394,15 +394,15 @@ def test_the_hosts_memory_ends(here, monkeypatch, capsys):
 )
 def test_limits_of_containers_and_batch_systems_hold(adapter, tmp_path, monkeypatch, own, limits, least):
     """Work beyond the limit is refused, because the system would kill the process without a message."""
-    whole = _host_memory.host_memory()
+    whole = memory_limits.host_memory()
     for name, text in limits.items():
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text(text)
     if own is not None:
         (tmp_path / "self").write_text(own)
-    monkeypatch.setattr(_host_memory, "GROUPS", tmp_path)
-    monkeypatch.setattr(_host_memory, "OWN_GROUPS", tmp_path / "self")
-    assert _host_memory.host_memory() == (least or whole)
+    monkeypatch.setattr(memory_limits, "GROUPS", tmp_path)
+    monkeypatch.setattr(memory_limits, "OWN_GROUPS", tmp_path / "self")
+    assert memory_limits.host_memory() == (least or whole)
     device = adapter.queue.device
     if least and device.type & cl.device_type.CPU:
         assert adapter.memory_needed(BOX, 0.05) < least

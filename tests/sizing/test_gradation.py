@@ -13,7 +13,7 @@ import clvoro
 from clvoro import Box, earth, sizing
 from clvoro.errors import InputError, InputTypeError, MemoryLimitError, SizeFieldError
 from clvoro.opencl.engine import Engine
-from clvoro.opencl.host_memory import host_memory
+from clvoro.opencl.memory_limits import host_memory
 from clvoro.sizing.field import on_domain
 from clvoro.sizing.gradation import Gradation, globe_columns
 
@@ -349,7 +349,7 @@ def test_host_memory_is_the_limit_of_the_process():
     assert 1e8 < whole < 1e15
     text = (
         "import resource; resource.setrlimit(resource.RLIMIT_AS, (3 << 30, 3 << 30))\n"
-        "from clvoro.opencl.host_memory import host_memory; print(host_memory())"
+        "from clvoro.opencl.memory_limits import host_memory; print(host_memory())"
     )
     found = subprocess.run([sys.executable, "-c", text], capture_output=True, text=True, check=True)
     assert int(found.stdout) == min(3 << 30, whole)

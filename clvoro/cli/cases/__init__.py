@@ -20,9 +20,9 @@ from ...geometry.boundary_layers import Layers
 from ...geometry.domain import Domain
 from ...geometry.polygon import Polygon
 from ...io.atomic import atomic_file
-from . import schema, toml
+from . import schema
 from .checks import file_name
-from .files import FOLDER, WRITTEN, locate
+from .files import FOLDER, LONGEST, WRITTEN, locate, read_toml, write_toml
 
 __all__ = ["WRITTEN", "Case", "builtin_cases", "load_case"]
 
@@ -55,7 +55,7 @@ class Case:
         """
         place = f"{name}:"
         try:
-            checked = schema.check_case(toml.read(text), place)
+            checked = schema.check_case(read_toml(text), place)
         except InputError:
             raise
         except ValueError as error:
@@ -165,7 +165,7 @@ class Case:
 
     def text(self, header: tuple[str, ...] = ()) -> str:
         """Return the text of `case.toml`."""
-        return toml.write(self._moved()[0], header)
+        return write_toml(self._moved()[0], header)
 
     def write(self, folder: Path, header: tuple[str, ...] = ()) -> Path:
         """Write `case.toml` into `folder`, with copies of the files that it names; return its path.
@@ -246,7 +246,7 @@ def load_case(name: str | Path) -> Case:
         return Case.from_toml(known[str(name)], str(name))
     path = Path(name)
     try:
-        text = read_text(path, toml.LONGEST)
+        text = read_text(path, LONGEST)
     except (OSError, UnicodeDecodeError) as error:
         near = difflib.get_close_matches(str(name), list(known), 1, 0.5)
         hint = f"; did you mean {near[0]!r}?" if near else ""
