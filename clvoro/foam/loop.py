@@ -8,6 +8,7 @@ import json
 import math
 import shutil
 import time
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from dataclasses import fields as fields_of
@@ -17,7 +18,8 @@ from typing import Any, cast
 
 import numpy as np
 
-from ..adaptation.options import EffortName
+from ..adaptation.options import EffortName, Start
+from ..adaptation.tuning import NEAR_ERROR
 from ..adapter import Adapter
 from ..arguments import check_integer, check_number, warn
 from ..errors import InputError, InputTypeError, LostFieldsWarning, MismatchWarning
@@ -151,11 +153,11 @@ def adapt_case(
 ) -> list[FoamCycle]:
     """Adapt the mesh of a case of OpenFOAM to its latest solution, `cycles` times.
 
-    A cycle reads the latest time, estimates sizes from its fields, adapts the present generators to them, and transfers
-    all fields in cells. The new mesh and its fields become the latest time, in place of the old
-    one, in one step: at any moment the case has a mesh that fits its fields. Fluxes `phi` are projected so that they
-    are free of divergence. Names and types of patches and boundary conditions stay; their lists of values are
-    interpolated.
+    A cycle reads the latest time, estimates sizes from its fields, adapts the present generators to them, or makes new
+    ones if the sizes differ much, and transfers all fields in cells. The new mesh and its fields become the latest
+    time, in place of the old one, in one step: at any moment the case has a mesh that fits its fields. Fluxes `phi` are
+    projected so that they are free of divergence. Names and types of patches and boundary conditions stay; their lists
+    of values are interpolated.
 
     With `solver` the case is solved first, between the cycles, and at the end. A call that was killed goes on where it
     was, if it is repeated.
@@ -188,7 +190,8 @@ def adapt_case(
     effort : "fast", "default" or "best"
         As for `Adapter.run`.
     pictures : bool
-        Draw the mesh of each cycle, colored by the size of U, or of the first field, into ``clvoro/cycle-K.png`` (2D).
+        Draw the mesh of each cycle, colored by the size of U, or of the first field, into ``clvoro/cycle-K.png``, and
+        all side by side into ``clvoro/cycles.png``. In space they are sections.
     adapter : Adapter, optional
         By default the shared one, on the best device.
     on_cycle : callable, optional
@@ -279,6 +282,10 @@ class _Loop:
             note = self._note(case.latest())
             known = self._known(note) or self._solve(solver, note, length)
             if note["cycle"] >= cycles:
+                if self.pictures:
+                    latest = case.latest()
+                    old = self._present(latest, note, mesh)
+                    self._draw(old, case.fields(latest), known)
                 on_cycle(known)
                 return self.rows
             on_cycle(self._adapt(known, note, mesh))
@@ -363,10 +370,8 @@ class _Loop:
         """Make the next mesh, transfer the fields, and put them in place; return the row with figures of the mesh."""
         case, latest = self.case, self.case.latest()
         start = time.perf_counter()
-        folder = case.mesh_folder(latest)
-        foam = self._mesh_in(folder)
-        old = MeshOfCase.of(foam, self._diagram(folder, foam, mesh if note["cycle"] == 0 else None))
-        fields = case.fields(latest)
+        old = self._present(latest, note, mesh)
+        foam, fields = old.foam, case.fields(latest)
         _check_values(fields, foam)
         check_fluxes(fields, foam)
         least = _CELLS_PER_PATCH * len(foam.types)
@@ -379,9 +384,8 @@ class _Loop:
         size = self._sizes_in_window(fields, old, latest)
         layers = tuple(_layers_of(note["layers"])) if self.layers is None else self.layers
         domain = old.diagram.domain
-        made = self.adapter.run(
-            domain, size, self.effort, points=old.diagram.points, n_cells=self.n_cells, layers=layers
-        )
+        points = _generators(old.diagram, size)
+        made = self.adapter.run(domain, size, self.effort, points=points, n_cells=self.n_cells, layers=layers)
         mesh_seconds = time.perf_counter() - start
         make_folder(case.own)
         target = case.own / f"next-{latest.name}"
@@ -399,8 +403,8 @@ class _Loop:
         for moved in transfer_fields(fields, old, new, self.adapter):
             moved.write(target / moved.name, latest.name)
         transfer_seconds = time.perf_counter() - start
-        if self.pictures and old.diagram.domain.dim == 2:
-            self._draw(old, fields, row.cycle)
+        if self.pictures:
+            self._draw(old, fields, row)
         done = replace(
             row,
             predicted_error=size.norm,
@@ -428,6 +432,12 @@ class _Loop:
                 LostFieldsWarning,
             )
 
+    def _present(self, latest: Time, note: dict[str, Any], mesh: object) -> MeshOfCase:
+        """Return the mesh of the latest time; `mesh` is that of the caller for the first cycle."""
+        folder = self.case.mesh_folder(latest)
+        foam = self._mesh_in(folder)
+        return MeshOfCase.of(foam, self._diagram(folder, foam, mesh if note["cycle"] == 0 else None))
+
     def _diagram(self, folder: Path, foam: FoamMesh, given: object) -> Diagram:
         """Return the diagram of the present mesh: given, kept beside it, or of the boundary and the centroids."""
         if given is None and (folder / _MESH).exists():
@@ -438,7 +448,10 @@ class _Loop:
             given = given.diagram
         if given is None:
             domain = foam.domain()
-            return self.adapter.diagram(domain, foam.centroids[:, : domain.dim])
+            with warnings.catch_warnings():
+                # The solver has another mesh: what it would say of this one does not matter.
+                warnings.simplefilter("ignore", MismatchWarning)
+                return self.adapter.diagram(domain, foam.centroids[:, : domain.dim])
         if not isinstance(given, Diagram):
             raise InputTypeError(f"mesh is a {type(given).__name__}, expected a clvoro.Result, a Diagram or a path")
         own, there = set(given.domain.boundary_names), set(foam.types)
@@ -481,17 +494,41 @@ class _Loop:
             raise InputTypeError(f"sizes returned a {type(made).__name__}, expected a clvoro.sizing.Estimate")
         return made
 
-    def _draw(self, old: MeshOfCase, fields: Sequence[FoamField], cycle: int) -> None:
-        """Draw the mesh and the solution of a cycle."""
+    def _draw(self, old: MeshOfCase, fields: Sequence[FoamField], row: FoamCycle) -> None:
+        """Draw the mesh and the solution of a cycle, in space a section, and all cycles up to it side by side."""
         import importlib.util
 
         if importlib.util.find_spec("matplotlib") is None:
             return
+        from matplotlib import image, pyplot
+
         shown = min((one for one in fields if one.in_cells), key=lambda one: one.name != "U")
         values = old.to_diagram(shown.internal.rows(old.foam.n_cells))
-        figure = old.diagram.plot(np.linalg.norm(values, axis=1), label=shown.name)
-        figure.axes[0].set_title(f"cycle {cycle}: {old.foam.n_cells:,} cells", loc="left")
-        figure.savefig(self.case.own / f"cycle-{cycle}.png", dpi=150)
+        view = None if old.foam.is_plane else "slice"
+        figure = old.diagram.plot(np.linalg.norm(values, axis=1), view, label=shown.name)
+        figure.axes[0].set_title(f"cycle {row.cycle}: {old.foam.n_cells:,} cells", loc="left")
+        own = self.case.own
+        figure.savefig(own / f"cycle-{row.cycle}.png", dpi=150)
+        pyplot.close(figure)
+        paths = [own / f"cycle-{k}.png" for k in range(row.cycle + 1)]
+        parts = [image.imread(path) for path in paths if path.exists()]
+        high, wide = (max(part.shape[axis] for part in parts) for axis in (0, 1))
+        columns = min(len(parts), max(1, round(math.sqrt(len(parts) * high / wide))))
+        page = np.ones((-(-len(parts) // columns) * high, columns * wide, parts[0].shape[2]), parts[0].dtype)
+        for k, part in enumerate(parts):
+            top, left = k // columns * high, k % columns * wide
+            page[top : top + part.shape[0], left : left + part.shape[1]] = part
+        image.imsave(own / "cycles.png", page)
+
+
+def _generators(old: Diagram, size: Estimate) -> np.ndarray | Start:
+    """Return the generators of a mesh if they only need to be corrected for the sizes, else those of a new mesh.
+
+    From afar, as from a mesh that is graded around a wall to one that is coarse there, a run of one level needs more
+    steps than one without generators, and may leave fine cells where they are not wanted.
+    """
+    error = old.volumes ** (1 / old.domain.cell_dim) / size(old.centroids) - 1
+    return old.points if np.abs(error).mean() <= NEAR_ERROR else "density"
 
 
 def _check_values(fields: Sequence[FoamField], foam: FoamMesh) -> None:
