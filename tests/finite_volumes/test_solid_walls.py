@@ -1,6 +1,8 @@
 """Meshes of solids: cells that end at a triangulated surface."""
 
 import contextlib
+import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -209,7 +211,7 @@ def l_cell(ctx):
     surface = WallSurface(solid)
     near = NearWalls.of(surface, x, h, whole_faces(ctx, solid, x, h))
     made = _Maker(surface, near, np.zeros(len(near.sizes), np.int8)).mesh()
-    cures = Cures(surface, made.faces, near.sizes[made.home])
+    cures = Cures(surface, made.faces, made.home, near.sizes[made.home])
     return cures, [c for c in range(made.faces.n_cells) if cures._concave_edges(cures.edits, c)]
 
 
@@ -244,6 +246,28 @@ def test_a_cut_makes_two_convex_cells_of_one(ctx):
         found.append(excess.sum())
         assert len(trial.alive(parts)) == 2
     assert min(found) == 0
+
+
+def test_cures_are_repeated_where_cells_are_the_same(ctx):
+    """The other mesh has its vertices and loops in another order; then one of its cells differs."""
+    cures, cells = l_cell(ctx)
+    assert [cures.cure(c) for c in cells[:2]] == [True, True]
+    mesh = cures.edits.mesh
+    order = np.random.default_rng(1).permutation(len(mesh.points))
+    points = np.empty_like(mesh.points)
+    points[order] = mesh.points
+    corners = np.concatenate([np.roll(order[mesh.corners[a:b]], 1) for a, b in itertools.pairwise(mesh.starts)])
+    other = replace(mesh, points=points, corners=corners.astype(np.int32))
+    again = Cures(cures.surface, other, cures.home, cures.sizes, cures)
+    assert len(again.edits.taken) == len(cures.edits.taken) > 0
+    expected, found = cures.edits.result()[0], again.edits.result()[0]
+    assert found.n_cells == expected.n_cells > mesh.n_cells
+    np.testing.assert_allclose(found.measures.volumes, expected.measures.volumes, rtol=1e-9)
+    first = cures.edits.taken[0]
+    v = order[next(v for k in first.faces_of(cells[0]) for v in first.face(k)[2] if v < len(order))]
+    points[v] += 1e-3 * H
+    again = Cures(cures.surface, replace(other, points=points.copy()), cures.home, cures.sizes, cures)
+    assert len(again.edits.taken) < len(cures.edits.taken)
 
 
 def test_mergers_losses_and_collapses_change_what_they_name(ctx):

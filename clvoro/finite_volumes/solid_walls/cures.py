@@ -15,7 +15,7 @@ import numpy as np
 
 from ...mesh.faces import Faces
 from .cutting import CellCut, planes_through
-from .editing import Edge, Edits, area_of, between, edges_of, judge
+from .editing import Edge, Edits, Matches, area_of, between, edges_of, judge
 from .mend import rejected_at_walls, with_neighbors
 from .wall_surface import WallSurface
 
@@ -49,6 +49,8 @@ _BRANCHES, _MOST_BAD = 2, 3
 
 Gain = tuple[int, float, float]
 """Change of the number of rejected cells, and of their excess; the worst measure after it. See `judge`."""
+Option = tuple[Gain, Edits, list[int]]
+"""What a cure gains, its changes, and which of the cells that they touch are rejected after it."""
 
 
 class Cures:
@@ -58,8 +60,12 @@ class Cures:
     ----------
     surface : WallSurface
     faces : Faces
+    home : (n,) int
+        Names of the cells.
     sizes : (n,) float
         h of the cells.
+    earlier : Cures, optional
+        Of a mesh that has many of the cells, too. What has been found for these is taken over.
 
     Attributes
     ----------
@@ -69,9 +75,28 @@ class Cures:
         How often cures have been tried on a cell.
     """
 
-    def __init__(self, surface: WallSurface, faces: Faces, sizes: np.ndarray) -> None:
-        self.surface, self.edits, self.sizes = surface, Edits(faces), sizes
+    def __init__(
+        self, surface: WallSurface, faces: Faces, home: np.ndarray, sizes: np.ndarray, earlier: Cures | None = None
+    ) -> None:
+        self.surface, self.edits, self.home, self.sizes = surface, Edits(faces), home, sizes
         self.changes, self.searches, self.changed, self.tried = 0, 0, dict[int, int](), dict[int, int]()
+        self.excess: dict[int, tuple[int, float]] = {}
+        self.judged: dict[tuple[Edits, int, bool], list[Option]] = {}
+        if earlier is not None:
+            self._take_over(earlier)
+
+    def _take_over(self, earlier: Cures) -> None:
+        """Make the changes of earlier cures, and pass over cells where none helped, where the cells are the same."""
+        old = earlier.edits
+        matches = Matches(old, earlier.home, self.edits, self.home)
+        cells = self.edits.repeat(old, matches)
+        self.changes = earlier.changes
+        self.changed = {cells[c]: when for c, when in earlier.changed.items() if c in cells}
+        changed = old.touched
+        for c, when in earlier.tried.items():
+            around = {c, *old.neighbors(c)}
+            if when == earlier.stamp(c) and all(n in cells or (n not in changed and matches.find(n)) for n in around):
+                self.tried[cells[c] if c in cells else matches.cells[c]] = when
 
     def h(self, edits: Edits, cell: int) -> float:
         """Return the size of a cell."""
@@ -80,10 +105,12 @@ class Cures:
     def cure(self, cell: int) -> bool:
         """Make the best change to the mesh around a cell if it is rejected; return whether one helps."""
         edits = self.edits
-        if self.tried.get(cell) == self.stamp(cell) or not edits.faces_of(cell) or judge([(edits, [cell])])[0][0] == 0:
+        if not edits.faces_of(cell) or self.tried.get(cell) == self.stamp(cell) or self.searches >= _MOST:
             return False
-        if self.searches >= _MOST:
+        self.measure([cell])
+        if self.excess[cell][1] == 0:
             return False
+        self.judged = {}
         for last in (False, True):
             self.searches += 1
             if (found := self._best(edits, cell, _AHEAD, last)) is not None:
@@ -93,6 +120,14 @@ class Cures:
                 return True
         self.tried[cell] = self.stamp(cell)
         return False
+
+    def measure(self, cells: list[int]) -> None:
+        """Judge cells that have changed, or with neighbors that have, since they were judged."""
+        stamps = {c: self.stamp(c) for c in cells}
+        new = [c for c, when in stamps.items() if self.excess.get(c, (-1, 0))[0] != when]
+        if new:
+            found = judge([(self.edits, new)])[0][0].tolist()
+            self.excess |= {c: (stamps[c], excess) for c, excess in zip(new, found, strict=True)}
 
     def stamp(self, cell: int) -> int:
         """Return the number of the last change of a cell or a neighbor."""
@@ -104,22 +139,9 @@ class Cures:
         Up to `ahead` cures of other cells may follow one that does not help by itself. With `last` cures are also
         tried that leave out a crease or a part of the solid.
         """
-        cures = [self.cuts, self.transfers, self.collapses, self.mergers, self.halves]
-        cures += [self.unions, self.losses] if last else []
-        trials = [t for cure in cures for t in cure(edits, cell)]
-        trials = [t for t in trials if all(t.is_sound(c) for c in t.touched if not t.is_vast(c))]
-        if not trials:
+        options = self._options(edits, cell, last)
+        if not options:
             return None
-        around = edits.alive(set().union(*(t.touched for t in trials)))
-        before = dict(zip(around, judge([(edits, around)])[0][0].tolist(), strict=True))
-        cells = [t.alive(t.touched) for t in trials]
-        verdicts = judge(list(zip(trials, cells, strict=True)))
-        options = []
-        for trial, mine, (excess, worst) in zip(trials, cells, verdicts, strict=True):
-            old = [before.get(c, 0.0) for c in trial.touched]
-            fewer = int((excess > 0).sum()) - sum(e > 0 for e in old)
-            gain = (fewer, float(excess.sum()) - sum(old), float(worst.max(initial=0)))
-            options.append((gain, trial, [c for c, e in zip(mine, excess.tolist(), strict=True) if e > 0]))
         gain, trial, _ = min(options, key=lambda o: o[0])
         if _helps(gain):
             return gain, trial
@@ -128,11 +150,38 @@ class Cures:
         for gain, trial, bad in sorted(options, key=lambda o: o[0][1])[:_BRANCHES]:
             for c in bad[:_MOST_BAD]:
                 if trial.faces_of(c) and (further := self._best(trial, c, ahead - 1, last)) is not None:
-                    trial.take(further[1])
                     gain = (gain[0] + further[0][0], gain[1] + further[0][1], max(gain[2], further[0][2]))
+                    trial = further[1]
             if _helps(gain):
                 return gain, trial
         return None
+
+    def _options(self, edits: Edits, cell: int, last: bool) -> list[Option]:
+        """Return all cures of a cell that leave cells closed. Each search judges them once."""
+        if (edits, cell, last) not in self.judged:
+            cures = [self.cuts, self.transfers, self.collapses, self.mergers, self.halves]
+            if last:
+                cures = [self.unions, self.losses]
+            self.judged[edits, cell, last] = self._judged(edits, [t for cure in cures for t in cure(edits, cell)])
+        options = self.judged[edits, cell, last]
+        return self._options(edits, cell, False) + options if last else options
+
+    def _judged(self, edits: Edits, trials: list[Edits]) -> list[Option]:
+        """Return what those trials gain that leave cells closed."""
+        trials = [t for t in trials if all(t.is_sound(c) for c in t.touched if not t.is_vast(c))]
+        if not trials:
+            return []
+        around = edits.alive(set().union(*(t.touched for t in trials)))
+        cells = [t.alive(t.touched) for t in trials]
+        (old, _), *verdicts = judge([(edits, around), *zip(trials, cells, strict=True)])
+        before = dict(zip(around, old.tolist(), strict=True))
+        options = []
+        for trial, mine, (excess, worst) in zip(trials, cells, verdicts, strict=True):
+            known = [before.get(c, 0.0) for c in trial.touched]
+            fewer = int((excess > 0).sum()) - sum(e > 0 for e in known)
+            gain = (fewer, float(excess.sum()) - sum(known), float(worst.max(initial=0)))
+            options.append((gain, trial, [c for c, e in zip(mine, excess.tolist(), strict=True) if e > 0]))
+        return options
 
     # Cuts.
 
@@ -246,9 +295,10 @@ class Cures:
 
     def mergers(self, edits: Edits, cell: int) -> Iterator[Edits]:
         """Merge a cell with a neighbor."""
+        is_small = self._is_small(edits, cell)
         for other in edits.alive(edits.neighbors(cell)):
             for gone, left in ((cell, other), (other, cell)):
-                if gone >= edits.mesh.n_cells or self._volume(edits, gone) < _SMALL * self.h(edits, gone) ** 3:
+                if is_small if gone == cell else self._is_small(edits, other):
                     trial = edits.trial()
                     if _merge(trial, gone, left):
                         yield trial
@@ -308,6 +358,10 @@ class Cures:
                 trial.drop(k)
                 trial.put(k, other, wall, loop)
             yield trial
+
+    def _is_small(self, edits: Edits, cell: int) -> bool:
+        """Return whether a cell may be merged with a neighbor."""
+        return cell >= edits.mesh.n_cells or self._volume(edits, cell) < _SMALL * self.h(edits, cell) ** 3
 
     @staticmethod
     def _volume(edits: Edits, cell: int) -> float:
@@ -385,18 +439,26 @@ def _helps(gain: Gain) -> bool:
 
 
 def cured(
-    surface: WallSurface, faces: Faces, home: np.ndarray, own: np.ndarray, sizes: np.ndarray, rejected: np.ndarray
-) -> tuple[Faces, np.ndarray, np.ndarray, np.ndarray]:
-    """Return the mesh with its `rejected` cells (k,) cured where that works, `home`, `own`, and what is rejected.
+    surface: WallSurface,
+    faces: Faces,
+    home: np.ndarray,
+    own: np.ndarray,
+    sizes: np.ndarray,
+    rejected: np.ndarray,
+    earlier: Cures | None,
+) -> tuple[Faces, np.ndarray, np.ndarray, np.ndarray, Cures | None]:
+    """Return the mesh with its `rejected` cells (k,) cured where that works, `home`, `own`, rejected cells, cures.
 
     All as in `_Made`. The mesh comes back as it is if in the end more of its cells would be rejected than before.
+    `earlier` cures are those of an earlier mesh of the same cells, of which the walls may differ.
     """
     if len(rejected) > _TOO_MANY * faces.n_cells:
-        return faces, home, own, rejected
-    cures = Cures(surface, faces, sizes)
+        return faces, home, own, rejected, None
+    cures = Cures(surface, faces, home, sizes, earlier)
     todo, again = rejected.tolist(), True
     while again:
         again = False
+        cures.measure(cures.edits.alive(todo))
         for cell in todo:
             for _ in range(_BUDGET):
                 if not cures.cure(cell):
@@ -407,7 +469,7 @@ def cured(
     changed = np.isin(cells, [*rejected.tolist(), *cures.edits.touched])
     left = rejected_at_walls(made, with_neighbors(made, changed))
     if len(left) > len(rejected):
-        return faces, home, own, rejected
+        return faces, home, own, rejected, None
     origin = np.array([cures.edits.origins.get(c, c) for c in cells.tolist()])
     is_own = (cells < len(own)) & np.append(own, np.zeros(cures.edits.next_cell, bool))[cells]
-    return made, home[origin], is_own, left
+    return made, home[origin], is_own, left, cures

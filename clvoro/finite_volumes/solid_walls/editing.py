@@ -17,6 +17,8 @@ from ..gate import LEAST_DETERMINANT, LEAST_MEASURE
 
 _MOST_FACES = 200
 """A cell with more faces is the one that `NearWalls` has in place of all cells far from walls; it is not judged."""
+_ROUNDING = 1e-9
+"""Places closer than this, over the extent of the mesh, are the same."""
 Face = tuple[int, int, tuple[int, ...]]
 """Owner, neighbor and corners; see `Faces`."""
 Edge = tuple[int, int]
@@ -38,6 +40,8 @@ class Edits:
         Cells whose faces, or whose points, have changed, also those that are gone.
     origins : dict of int
         The cell of `mesh` of which each new cell is a part.
+    taken : list of Edits
+        Trials that have become a part of these edits, in turn.
     """
 
     def __init__(self, mesh: Faces, parent: Edits | None = None) -> None:
@@ -46,6 +50,7 @@ class Edits:
         self._cells: dict[int, frozenset[int]] = {}
         self._points: dict[int, np.ndarray] = {}
         self.touched: set[int] = set()
+        self.taken: list[Edits] = []
         self.origins: dict[int, int] = {} if parent is None else dict(parent.origins)
         if parent is None:
             self.next_face, self.next_cell, self.next_point = len(mesh), mesh.n_cells, len(mesh.points)
@@ -67,6 +72,7 @@ class Edits:
         if trial.parent is not self:
             assert trial.parent is not None
             self.take(trial.parent)
+        self.taken.append(trial)
         self._faces |= trial._faces
         self._cells |= trial._cells
         self._points |= trial._points
@@ -81,11 +87,7 @@ class Edits:
         at = self
         while k not in at._faces:
             if at.parent is None:
-                if k not in self._known_faces:
-                    m = self.mesh
-                    loop = tuple(m.corners[m.starts[k] : m.starts[k + 1]].tolist())
-                    self._known_faces[k] = int(m.owner[k]), int(m.neighbor[k]), loop
-                return self._known_faces[k]
+                return self.mesh_face(k)
             at = at.parent
         found = at._faces[k]
         assert found is not None
@@ -97,11 +99,23 @@ class Edits:
         while cell not in at._cells:
             if at.parent is None:
                 if cell not in self._known_cells:
-                    rows = slice(*self._of_cell[cell : cell + 2]) if cell < self.mesh.n_cells else slice(0)
-                    self._known_cells[cell] = frozenset(self._face_of[rows].tolist())
+                    self._known_cells[cell] = frozenset(self.mesh_faces(cell))
                 return self._known_cells[cell]
             at = at.parent
         return at._cells[cell]
+
+    def mesh_faces(self, cell: int) -> list[int]:
+        """Return the faces of a cell before all changes."""
+        rows = slice(*self._of_cell[cell : cell + 2]) if cell < self.mesh.n_cells else slice(0)
+        return self._face_of[rows].tolist()
+
+    def mesh_face(self, k: int) -> Face:
+        """Return a face before all changes."""
+        if k not in self._known_faces:
+            m = self.mesh
+            loop = tuple(m.corners[m.starts[k] : m.starts[k + 1]].tolist())
+            self._known_faces[k] = int(m.owner[k]), int(m.neighbor[k]), loop
+        return self._known_faces[k]
 
     def is_vast(self, cell: int) -> bool:
         """Return whether a cell stands for all that are far from walls."""
@@ -238,6 +252,52 @@ class Edits:
                 seen.add(edge)
         return len(faces) > 3 and all((b, a) in seen for a, b in seen)
 
+    def repeat(self, other: Edits, matches: Matches) -> dict[int, int]:
+        """Take the trials again that other edits have taken, where both meshes have the same cells.
+
+        Parameters
+        ----------
+        other : Edits
+            Of another mesh.
+        matches : Matches
+            Between that mesh and this one. New faces and vertices are added to it.
+
+        Returns
+        -------
+        dict of int
+            The number here of each cell that has changed in all trials of which it was a part.
+        """
+        cells, faces, points = dict[int, int](), matches.faces, matches.points
+        different = set[int]()
+        for done in other.taken:
+            if done.touched & different or not all(
+                c in cells or c in done.origins or matches.find(c) for c in done.touched
+            ):
+                different |= done.touched
+                continue
+            trial = self.trial()
+            cells |= {c: matches.cells[c] for c in done.touched if c in matches.cells}
+            for c in sorted(done.origins.keys() & done.touched - cells.keys()):
+                cells[c] = trial.add_cell(cells[done.origins[c]])
+            for v, x in sorted(done._points.items()):
+                if v not in points:
+                    points[v] = trial.next_point
+                    trial.next_point += 1
+                trial._points[points[v]] = x
+            for k, face in sorted(done._faces.items()):
+                if k not in faces:
+                    faces[k] = trial.next_face
+                    trial.next_face += 1
+                trial._faces[faces[k]] = face and (
+                    cells[face[0]],
+                    cells[face[1]] if face[1] >= 0 else face[1],
+                    tuple(points[v] for v in face[2]),
+                )
+            trial._cells = {cells[c]: frozenset(faces[k] for k in mine) for c, mine in done._cells.items()}
+            trial.touched = {cells[c] for c in done.touched}
+            self.take(trial)
+        return {c: twin for c, twin in cells.items() if c not in different}
+
     # Results.
 
     def alive(self, cells: Iterable[int]) -> list[int]:
@@ -281,6 +341,67 @@ class Edits:
             half_face=np.concatenate([m.half_face[rows], np.full(len(new), -1)])[order],
         )
         return faces.compact(), cells
+
+
+class Matches:
+    """Cells of two meshes that are the same up to rounding. Each is searched for once.
+
+    Parameters
+    ----------
+    one, other : Edits
+        All changes are ignored.
+    names_of_one, names_of_other : (n,) int
+        Cells with one name may be the same.
+
+    Attributes
+    ----------
+    cells, faces, points : dict of int
+        Numbers in the other mesh.
+    """
+
+    def __init__(self, one: Edits, names_of_one: np.ndarray, other: Edits, names_of_other: np.ndarray) -> None:
+        self._one, self._other = one, other
+        named = dict(zip(names_of_other.tolist(), range(len(names_of_other)), strict=True))
+        self._named = [named.get(name, -1) for name in names_of_one.tolist()]
+        self._near = _ROUNDING * float(np.ptp(one.mesh.points, axis=0).max())
+        self._known: dict[int, bool] = {}
+        self.cells, self.faces, self.points = dict[int, int](), dict[int, int](), dict[int, int]()
+
+    def find(self, cell: int) -> bool:
+        """Return whether the other mesh has a cell, too."""
+        if cell not in self._known:
+            self._known[cell] = self._match(cell)
+        return self._known[cell]
+
+    def _match(self, cell: int) -> bool:
+        twin, mine = self._named[cell], self._one.mesh_faces(cell)
+        theirs = self._other.mesh_faces(twin) if twin >= 0 else []
+        if len(mine) != len(theirs) or len(mine) > _MOST_FACES:
+            return False
+        faces, points = dict[int, int](), dict[int, int]()
+        beyond = [(k, self._other.mesh_face(k)) for k in theirs]
+        for k in mine:
+            owner, neighbor, loop = self._one.mesh_face(k)
+            sides = self._named[owner], self._named[neighbor] if neighbor >= 0 else neighbor
+            for q, (i, j, around) in beyond:
+                if (i, j) == sides and (turned := self._turned(loop, around)):
+                    faces[k] = q
+                    points |= zip(loop, turned, strict=True)
+                    break
+            else:
+                return False
+        self.cells[cell] = twin
+        self.faces |= faces
+        self.points |= points
+        return len(set(faces.values())) == len(faces)
+
+    def _turned(self, loop: tuple[int, ...], other: tuple[int, ...]) -> tuple[int, ...]:
+        """Return the loop `other` from the corner on with which `loop` begins; empty if they are not the same."""
+        if len(loop) != len(other):
+            return ()
+        x, y = self._one.mesh.points[list(loop)], self._other.mesh.points[list(other)]
+        first = int(np.abs(y - x[0]).sum(axis=1).argmin())
+        return other[first:] + other[:first] if np.abs(np.roll(y, -first, axis=0) - x).max() < self._near else ()
 
 
 def edges_of(loop: tuple[int, ...]) -> Iterator[tuple[int, int]]:

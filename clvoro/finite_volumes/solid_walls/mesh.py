@@ -16,7 +16,7 @@ from ...mesh.diagram import Diagram
 from ...mesh.faces import Faces
 from ..collapse import collapse_short
 from .chains import Crossings, cross_cells
-from .cures import cured
+from .cures import Cures, cured
 from .mend import narrow_faces, rejected_at_walls, with_neighbors
 from .near_walls import NearWalls
 from .pierce import IN, WALL, pierce_edges, sides, simplified
@@ -42,8 +42,6 @@ _FEW = 0.03
 """Largest share of generators without a cell; a solid with more of them is refused."""
 _PATIENCE, _ATTEMPTS = 3, 8
 """How often a mesh is made again without fewer rejected cells than before, and at all."""
-_ROUNDING = 1e-9
-"""Changes of meshes that are only rounding, over the extent of the solid."""
 _RINGS = 3
 """Rings of cells whose shapes, or neighbors' shapes, may change where edges of a cell are collapsed."""
 _MISSED = 0.1
@@ -64,23 +62,15 @@ class _Made:
         have been cut along concave creases.
     rejected : (k,) int
         See `rejected_at_walls`.
+    cures : Cures or None
+        What has been done to the cells.
     """
 
     faces: Faces
     home: np.ndarray
     own: np.ndarray
     rejected: np.ndarray
-
-    def is_like(self, other: _Made) -> bool:
-        """Return whether both have the same faces, up to rounding."""
-        one, two = self.faces, other.faces
-        if one.points.shape != two.points.shape or not all(
-            np.array_equal(getattr(one, name), getattr(two, name)) for name in ("owner", "neighbor")
-        ):
-            return False
-        size = float(np.ptp(one.points, axis=0).max())
-        pairs = ((one.points / size, two.points / size), (one.vectors[1] / size**2, two.vectors[1] / size**2))
-        return all(np.allclose(a, b, rtol=0, atol=_ROUNDING) for a, b in pairs)
+    cures: Cures | None = None
 
 
 def outer_generators(surface: WallSurface, points: np.ndarray, sizes: np.ndarray) -> np.ndarray:
@@ -174,8 +164,7 @@ def solid_diagram(
     near = NearWalls.of(surface, points, sizes, whole)
     del whole
     walls = np.full(len(near.sizes), EXACT, np.int8)
-    best, raw_best, kept = None, None, walls
-    since = 0
+    best, last, kept, since = None, None, walls, 0
     for attempt in range(1, _ATTEMPTS + 1):
         if since == _PATIENCE:
             break
@@ -188,19 +177,18 @@ def solid_diagram(
             if best is None:
                 raise
             break
+        last = _finished(
+            surface, near, raw, None if last is None else last.cures, lambda part, number=number: tell(part + number)
+        )
         since += 1
-        if best is None or raw_best is None or not raw.is_like(raw_best):
-            made = _finished(surface, near, raw, lambda part, number=number: tell(part + number))
-            if best is None or len(made.rejected) < len(best.rejected):
-                best, raw_best, kept, since = made, raw, walls.copy(), 0
-        else:
-            made = best
-            places = best.faces.generators[best.rejected]
-            if (surface.nearest_crease(places, 3 * near.sizes[best.home[best.rejected]])[0] < 0).all():
-                break  # without creases there the next attempts are the same
-        if not len(made.rejected):
+        places = last.faces.generators[last.rejected]
+        if best is None or len(last.rejected) < len(best.rejected):
+            best, kept, since = last, walls.copy(), 0
+        elif (surface.nearest_crease(places, 3 * near.sizes[last.home[last.rejected]])[0] < 0).all():
+            break  # without creases there the next attempts are the same
+        if not len(last.rejected):
             break
-        _simplify(walls, near, np.unique(made.home[made.rejected]))
+        _simplify(walls, near, np.unique(last.home[last.rejected]))
     assert best is not None
     rejected = best.faces.generators[best.rejected]
     tell("cells without walls")
@@ -234,9 +222,14 @@ def _check_lost(surface: WallSurface, near: NearWalls, home: np.ndarray) -> None
         )
 
 
-def _finished(surface: WallSurface, near: NearWalls, raw: _Made, tell: Callable[[str], object]) -> _Made:
-    """Return `raw` cells near the surface without short edges and slivers, cured where OpenFOAM rejects them."""
-    home, own = raw.home, raw.own
+def _finished(
+    surface: WallSurface, near: NearWalls, raw: _Made, earlier: Cures | None, tell: Callable[[str], object]
+) -> _Made:
+    """Return `raw` cells near the surface without short edges and slivers, cured where OpenFOAM rejects them.
+
+    `earlier` cures are taken over where the cells are the same.
+    """
+    home, own, cures = raw.home, raw.own, None
     tell("short edges at walls")
     faces = _collapsed(raw.faces, near.sizes[home])
     tell("checks of cells at walls")
@@ -250,11 +243,11 @@ def _finished(surface: WallSurface, near: NearWalls, raw: _Made, tell: Callable[
         faces = again
     if len(rejected):
         tell("cells that are rejected at walls")
-        faces, home, own, rejected = cured(surface, faces, home, own, near.sizes[home], rejected)
+        faces, home, own, rejected, cures = cured(surface, faces, home, own, near.sizes[home], rejected, earlier)
     if not own.all():
         centroids = faces.measures.geometry.centroids
         faces = replace(faces, generators=np.where(own[:, None], faces.generators, centroids))
-    return _Made(faces, home, own, rejected)
+    return _Made(faces, home, own, rejected, cures)
 
 
 def _collapsed(faces: Faces, sizes: np.ndarray, among: np.ndarray | None = None) -> Faces:
