@@ -49,19 +49,22 @@ HISTORY_DTYPE = np.dtype(
 
 
 class OtherParts(Protocol):
-    """The other parts of a mesh, as a `Result` of one of them sees them.
+    """The other parts of a mesh, as a `Result` of one of them sees them."""
 
-    Attributes
-    ----------
-    number, count : int
-        Number of this part; number of parts.
-    labels : (n,) int32
-        Names of the cells in the whole mesh, ascending.
-    """
+    @property
+    def number(self) -> int:
+        """Number of this part."""
+        ...
 
-    number: int
-    count: int
-    labels: np.ndarray
+    @property
+    def count(self) -> int:
+        """Number of parts."""
+        ...
+
+    @property
+    def labels(self) -> np.ndarray:
+        """Names of the cells in the whole mesh, in the order of rows, (n,) int32."""
+        ...
 
     def gather(self, result: Result) -> Result | None:
         """See `Result.gather`."""

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from typing import Any, TypeVar, cast
+from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import numpy as np
 
 from ..errors import InputError, InputTypeError, RankError
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
 
 Made = TypeVar("Made")
 PATIENCE, NAP = 200, 5e-5
@@ -36,10 +39,11 @@ class Peers:
     number, count, shared = 0, 1, False
     exchanges = reductions = 0
 
-    def exchange(self, sent: Sequence[np.ndarray]) -> list[np.ndarray]:
+    def exchange(self, sent: Sequence[np.ndarray], sizes: ArrayLike | None = None) -> list[np.ndarray]:
         """Send array k to part k, and return what each part has sent to this one, in the order of parts.
 
-        Arrays differ in their number of rows only.
+        Arrays differ in their number of rows only. `sizes` (p,) are those of the arrays that this part gets, if all
+        parts know theirs.
         """
         return list(sent)
 
@@ -133,17 +137,19 @@ class Ranks(Peers):
         self.number, self.count = comm.Get_rank(), comm.Get_size()
         self._failed = ""
 
-    def exchange(self, sent: Sequence[np.ndarray]) -> list[np.ndarray]:
-        """Tell the others the numbers of rows, then send the rows."""
+    def exchange(self, sent: Sequence[np.ndarray], sizes: ArrayLike | None = None) -> list[np.ndarray]:
+        """Tell the others the numbers of rows, if they do not know them, then send the rows."""
         self.exchanges += 1
-        own = sent[self.number]
-        sizes, found = np.array([len(values) for values in sent], np.int64), np.empty(self.count, np.int64)
-        self._complete(self._comm.Ialltoall(sizes, found))
+        own, found = sent[self.number], np.empty(self.count, np.int64)
+        if sizes is None:
+            self._complete(self._comm.Ialltoall(np.array([len(values) for values in sent], np.int64), found))
+        else:
+            found[:] = sizes
         received = [np.empty((int(size), *own.shape[1:]), own.dtype) for size in found]
         received[self.number] = own
         others = [part for part in range(self.count) if part != self.number]
         requests = [self._comm.Irecv(_bytes(received[part]), part) for part in others if found[part]]
-        packed = {part: np.ascontiguousarray(sent[part]) for part in others if sizes[part]}
+        packed = {part: np.ascontiguousarray(sent[part]) for part in others if len(sent[part])}
         requests += [self._comm.Isend(_bytes(values), part) for part, values in packed.items()]
         self._complete(*requests)
         return received

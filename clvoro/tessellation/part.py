@@ -12,6 +12,7 @@ position of a neighbor take its nearest image (the PERIODIC macros).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -27,6 +28,10 @@ from ..opencl.primitives import Gather
 
 if TYPE_CHECKING:
     from .device_diagram import Tessellation
+
+
+SUMS = 256
+"""Partial sums over the cells of a part."""
 
 
 @dataclass(frozen=True)
@@ -46,8 +51,10 @@ class Ghosts:
         If owners are in other parts. Ghosts are then in the order of these.
     parts : (g,) int
         With `peers`, the part of each owner, on the host.
-    sent : tuple of int32 arrays, device
-        Rows of this part whose values each of the parts needs.
+    sent : (s,) int32, device
+        Rows of this part whose values others need, part by part.
+    sent_counts, counts : (p,) int
+        How many rows each part needs, and how many ghosts it owns.
     """
 
     rows: cla.Array
@@ -55,7 +62,9 @@ class Ghosts:
     firsts: cla.Array | None = None
     peers: Peers | None = None
     parts: np.ndarray | tuple[int, ...] = ()
-    sent: tuple[cla.Array, ...] = ()
+    sent: cla.Array | None = None
+    sent_counts: np.ndarray | tuple[int, ...] = ()
+    counts: np.ndarray | tuple[int, ...] = ()
 
     @classmethod
     def of_peers(cls, engine: Engine, peers: Peers, parts: np.ndarray, rows: np.ndarray) -> Ghosts:
@@ -64,8 +73,16 @@ class Ghosts:
         The parts tell each other what they need.
         """
         wanted = [np.ascontiguousarray(rows[parts == part], np.int32) for part in range(peers.count)]
-        sent = tuple(engine.upload(needed, np.int32) for needed in peers.exchange(wanted))
-        return cls(engine.upload(rows, np.int32), peers=peers, parts=parts, sent=sent)
+        return cls.of_lists(engine, peers, parts, rows, peers.exchange(wanted))
+
+    @classmethod
+    def of_lists(
+        cls, engine: Engine, peers: Peers, parts: np.ndarray, rows: np.ndarray, sent: Sequence[np.ndarray]
+    ) -> Ghosts:
+        """Return the same, if the rows are known that each of the parts needs, `sent`."""
+        sizes, counts = np.array([len(needed) for needed in sent]), np.bincount(parts, minlength=peers.count)
+        needed = engine.upload(np.concatenate(sent), np.int32)
+        return cls(engine.upload(rows, np.int32), None, None, peers, parts, needed, sizes, counts)
 
     def fill(self, engine: Engine, n_own: int, values: cla.Array) -> None:
         """Fill the rows of `values` from `n_own` on with the values of the owners; see `Part.forward`."""
@@ -74,9 +91,12 @@ class Ghosts:
             forward = engine.kernels("tessellation/part").forward_values
             engine.run_each(forward, values.shape[0] - n_own, np.int32(n_own), self.rows, words, values)
             return
-        gather = Gather(engine)
-        packed = [gather.rows(rows, values).get() if len(rows) else values[:0].get() for rows in self.sent]
-        received = np.concatenate(self.peers.exchange(packed))
+        assert self.sent is not None
+        packed = np.empty((0, *values.shape[1:]), values.dtype)
+        if len(self.sent):
+            packed = Gather(engine).rows(self.sent, values).get()
+        ends = np.cumsum(self.sent_counts)[:-1]
+        received = np.concatenate(self.peers.exchange(np.split(packed, ends), self.counts))
         if len(received):
             start = n_own * (values.nbytes // values.shape[0])
             cl.enqueue_copy(engine.queue, buffer_of(values), np.ascontiguousarray(received), dst_offset=start)
@@ -158,6 +178,16 @@ class Part:
         marks = engine.zeros(max(self.count - self.n_own, 1), np.int32)
         engine.run_each(engine.kernels("tessellation/part").mark_ghosts, self.n_own, t.starts, t.neighbors, marks)
         return self.n_own + np.flatnonzero(marks.get()[: self.count - self.n_own])
+
+    def sums(self, engine: Engine, t: Tessellation) -> np.ndarray:
+        """Return the volume of own cells, the signed sum of their faces with ghosts, and the sum of these, (3,).
+
+        The second one is zero over all parts, if each face has both sides.
+        """
+        sums = engine.scratch((SUMS, 3))
+        given = (t.starts, t.neighbors, self.labels, t.face_measures, t.volumes)
+        engine.run_each(engine.kernels("tessellation/part").sum_cells, SUMS, np.int32(self.n_own), *given, sums)
+        return sums.get().sum(axis=0, dtype=float)
 
     def forward(self, engine: Engine, values: cla.Array) -> None:
         """Fill the rows of ghosts in `values` (count, ...), of whole 32-bit words, with the values of their owners.

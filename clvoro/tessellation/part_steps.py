@@ -18,6 +18,7 @@ import pyopencl as cl
 import pyopencl.array as cla
 import scipy
 
+from ..errors import ClvoroError
 from ..geometry.domain import Domain
 from ..opencl.device_array import buffer_of
 from ..opencl.primitives import NamedArrays
@@ -35,6 +36,8 @@ SLACK = 1.05
 """Factor on the radii of balls: with a few more ghosts the next diagrams need no further ones."""
 NOISE = {"float64": 1e-6, "float32": 1e-4}
 """Bound of the round-off of a reach, as a share of it."""
+FILLED, MATCHED = {"float64": 1e-8, "float32": 1e-3}, {"float64": 1e-5, "float32": 1e-3}
+"""Largest differences of the volume of all cells from that of the domain, and of both sides of faces between parts."""
 GROUP = 64
 """Balls whose common box is looked at first."""
 
@@ -165,8 +168,7 @@ class PartSteps(DomainSteps):
         engine, n = self.stages.engine, len(self._x)
         order = np.argsort(self._parts, kind="stable")
         self._parts, self._rows = self._parts[order], self._rows[order]
-        sent = tuple(engine.upload(rows, np.int32) for rows in self._sent)
-        self._ghosts = Ghosts(engine.upload(self._rows, np.int32), peers=self.peers, parts=self._parts, sent=sent)
+        self._ghosts = Ghosts.of_lists(engine, self.peers, self._parts, self._rows, self._sent)
         assert self._labels is not None
         labels = np.empty(n + len(self._rows), np.int32)
         labels[:n] = self._labels.get()[:n]
@@ -231,8 +233,22 @@ class PartSteps(DomainSteps):
                 break
             self._caps = 2 * caps
         own = t.first(n) if t.n > n else t
+        self._check(part.sums(engine, own))
         whole = t if t.n == part.count else None
         return replace(own, part=part, whole=whole, points=part.points, sites=part.points)
+
+    def _check(self, sums: np.ndarray) -> None:
+        """Raise if the cells of all parts do not fill the domain, or faces between parts have one side."""
+        real = self.stages.engine.real
+        corners = self.box.device_corners(real)
+        volume, gap, faces = self.peers.total(sums)
+        measure = float(np.prod((corners[1] - corners[0])[: self.domain.dim].astype(float)))
+        off = abs(volume / measure - 1)
+        if off > FILLED[real.name] or abs(gap) > MATCHED[real.name] * faces:
+            raise ClvoroError(
+                f"the cells of all ranks differ from the domain by {off:.2g} of its volume, and faces between them by "
+                f"{abs(gap) / max(faces, 1e-300):.2g} of their area, expected none: ghosts are missing"
+            )
 
     def _ask(self, x: np.ndarray, radii: np.ndarray, more: np.ndarray, more_radii: np.ndarray) -> int:
         """Ask for the generators in balls around `x` (n, d) and `more` (k, d); return how many ghosts are new."""

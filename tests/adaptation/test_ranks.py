@@ -21,12 +21,21 @@ from mpi4py import MPI
 adapter = clvoro.Adapter(comm=MPI.COMM_WORLD)
 for dim in (2, 3):
     box = clvoro.Box((0,) * dim, (1,) * dim)
-    mesh = adapter.run(box, lambda p: (0.06 if dim == 2 else 0.12) * (1 + p[:, 0]), effort="fast")
+    mesh = adapter.run(box, lambda p: (0.08 if dim == 2 else 0.2) * (1 + p[:, 0]), effort="fast")
     whole = mesh.gather()
     assert (whole is None) == (MPI.COMM_WORLD.rank > 0)
     if whole is not None:
         assert whole.check(), whole.check()
         print(len(whole), len(mesh), whole.history["cells"][-1])
+
+def fail(row):
+    if MPI.COMM_WORLD.rank == 1 and row["step"] == 2:
+        raise OSError("no space left")
+
+try:
+    adapter.run(clvoro.Box((0, 0), (1, 1)), 0.1, "fast", callback=fail)
+except Exception as error:
+    print(type(error).__name__, error)
 """
 
 
@@ -116,6 +125,11 @@ def test_a_script_under_mpiexec(tmp_path):
     command = [str(mpiexec if mpiexec.exists() else "mpiexec"), "-n", "2", sys.executable, str(script)]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=240)
     assert done.returncode == 0, done.stderr[-3000:]
-    for line in done.stdout.splitlines():
+    lines = done.stdout.splitlines()
+    assert {line for line in lines if not line[0].isdigit()} == {
+        "RankError rank 1 of 2 has failed: OSError: no space left",
+        "OSError no space left",
+    }
+    for line in [line for line in lines if line[0].isdigit()]:
         cells, own, recorded = map(int, line.split())
         assert cells == recorded > own > cells / 3

@@ -25,8 +25,10 @@ class Threads(Peers):
         self._barrier.wait(WAIT)
         return found
 
-    def exchange(self, sent):
-        return [given[self.number] for given in self.gather(sent)]
+    def exchange(self, sent, sizes=None):
+        found = [given[self.number] for given in self.gather(sent)]
+        assert sizes is None or [len(rows) for rows in found] == list(sizes)
+        return found
 
 
 def run_parts(count, work):
