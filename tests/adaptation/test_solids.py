@@ -79,7 +79,7 @@ def test_exact_sizes_and_given_generators(ctx, volumes):
 def test_cells_that_walls_do_not_bound_are_warned_of(ctx):
     ball = clvoro.Solid.ball((0, 0, 0), 1.0, edge=0.2)
     with pytest.warns(clvoro.errors.MismatchWarning, match="do not bound"), np.errstate(all="ignore"):
-        clvoro.Adapter(ctx).run(ball, 1.0, "fast")
+        clvoro.Adapter(ctx).run(ball, 0.9, "fast")
 
 
 @pytest.mark.filterwarnings("ignore::clvoro.errors.SizeErrorWarning", "ignore::clvoro.errors.MismatchWarning")

@@ -103,7 +103,8 @@ class DensityTree:
         self.field, self._domain, self.boxes = field, domain, BoxTree(domain)
         self.coverage = coverage_of(self.boxes, domain)
         dim = domain.dim
-        while np.count_nonzero(self.coverage.occupied) << dim < _BASE[dim] and len(self.boxes) << dim < _MAX_BASE[dim]:
+        least = _BASE[dim] >> domain.curved_walls  # a solid does not fill its bounding box
+        while np.count_nonzero(self.coverage.occupied) << dim < least and len(self.boxes) << dim < _MAX_BASE[dim]:
             self.coverage.split(self.coverage.occupied)
         m = len(self.boxes)
         self.cells, self._differences, self._low, self._high = np.zeros((4, m))
