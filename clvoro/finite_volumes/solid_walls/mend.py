@@ -34,25 +34,31 @@ def narrow_faces(faces: Faces, sizes: np.ndarray, among: np.ndarray | None = Non
     return chosen & (faces.area < _NARROW * h**2)
 
 
-def rejected_at_walls(faces: Faces, among: np.ndarray | None = None) -> np.ndarray:
-    """Return the cells at walls, or beside these, that OpenFOAM rejects, (k,) int.
-
-    Parameters
-    ----------
-    faces : Faces
-    among : (n,) bool, optional
-        The cells that are judged; by default all.
-    """
+def rejected_at_walls(faces: Faces, judged: np.ndarray) -> np.ndarray:
+    """Return which of the cells `judged` (n,) bool at walls, or beside these, OpenFOAM rejects, (k,) int."""
     at_wall = _at_wall(faces)
-    mine = with_neighbors(faces, at_wall)
-    if among is not None:
-        mine &= among
-    kept = with_neighbors(faces, mine)
+    judged = judged & with_neighbors(faces, at_wall)
+    kept = with_neighbors(faces, judged)
     cells, part = np.flatnonzero(kept), faces.part(kept)[0]
     # Other faces are those of the diagram, whose tetrahedra are right.
     doubtful = at_wall[cells]
     tested = np.flatnonzero(doubtful[part.owner] | (doubtful[np.maximum(part.neighbor, 0)] & (part.neighbor >= 0)))
-    return cells[rejected_cells(part, tested, mine[cells])]
+    return cells[rejected_cells(part, tested, judged[cells])]
+
+
+def touching_walls(faces: Faces) -> np.ndarray:
+    """Return which cells have a vertex on a wall, (n,) bool."""
+    on = np.zeros(len(faces.points), bool)
+    on[faces.corners[faces.starts[faces.n_inner] :]] = True
+    return cells_of(faces, np.logical_or.reduceat(on[faces.corners], faces.starts[:-1]))
+
+
+def cells_of(faces: Faces, chosen: np.ndarray) -> np.ndarray:
+    """Return which cells have one of the faces `chosen` (f,) bool, (n,) bool."""
+    found = np.zeros(faces.n_cells, bool)
+    found[faces.owner[chosen]] = True
+    found[faces.neighbor[chosen & (faces.neighbor >= 0)]] = True
+    return found
 
 
 def with_neighbors(faces: Faces, cells: np.ndarray, rings: int = 1) -> np.ndarray:

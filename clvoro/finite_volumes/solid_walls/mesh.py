@@ -17,7 +17,7 @@ from ...mesh.faces import Faces
 from ..collapse import collapse_short
 from .chains import Crossings, cross_cells
 from .cures import Cures, cured
-from .mend import narrow_faces, rejected_at_walls, with_neighbors
+from .mend import cells_of, narrow_faces, rejected_at_walls, touching_walls, with_neighbors
 from .near_walls import NearWalls
 from .pierce import IN, WALL, pierce_edges, sides, simplified
 from .polygons import Divider, chain_loops, open_sides
@@ -42,8 +42,6 @@ _FEW = 0.03
 """Largest share of generators without a cell; a solid with more of them is refused."""
 _PATIENCE, _ATTEMPTS = 3, 8
 """How often a mesh is made again without fewer rejected cells than before, and at all."""
-_RINGS = 3
-"""Rings of cells whose shapes, or neighbors' shapes, may change where edges of a cell are collapsed."""
 _MISSED = 0.1
 """A crossing of a crease becomes a vertex of a chord on its face that is farther from it than this share of h."""
 
@@ -231,16 +229,14 @@ def _finished(
     """
     home, own, cures = raw.home, raw.own, None
     tell("short edges at walls")
-    faces = _collapsed(raw.faces, near.sizes[home])
+    faces, changed = _collapsed(raw.faces, near.sizes[home])
     tell("checks of cells at walls")
-    rejected = rejected_at_walls(faces)
+    rejected = rejected_at_walls(faces, changed | touching_walls(faces))
     if len(rejected):  # where a face has been collapsed, another small one may bulge out
-        around = np.zeros(faces.n_cells, bool)
-        around[rejected] = True
-        around = with_neighbors(faces, around)
-        again = _collapsed(faces, near.sizes[home], around)
-        rejected = rejected_at_walls(again, with_neighbors(faces, around, _RINGS))
-        faces = again
+        suspect = np.zeros(faces.n_cells, bool)
+        suspect[rejected] = True
+        faces, changed = _collapsed(faces, near.sizes[home], with_neighbors(faces, suspect))
+        rejected = rejected_at_walls(faces, with_neighbors(faces, changed | suspect))
     if len(rejected):
         tell("cells that are rejected at walls")
         faces, home, own, rejected, cures = cured(surface, faces, home, own, near.sizes[home], rejected, earlier)
@@ -250,10 +246,11 @@ def _finished(
     return _Made(faces, home, own, rejected, cures)
 
 
-def _collapsed(faces: Faces, sizes: np.ndarray, among: np.ndarray | None = None) -> Faces:
+def _collapsed(faces: Faces, sizes: np.ndarray, among: np.ndarray | None = None) -> tuple[Faces, np.ndarray]:
     """Return a mesh without short edges and small faces of cells at walls, and without faces that bulge out.
 
-    Cells that are not `among` (n,) bool stay as they are, but for the vertices that they share with the others.
+    Cells that are not `among` (n,) bool stay as they are, but for the vertices that they share with the others. Return
+    also which cells have changed, (n,) bool.
     """
     diagram = diagram_of(faces)
     at_wall = np.zeros(faces.n_cells, bool)
@@ -263,8 +260,14 @@ def _collapsed(faces: Faces, sizes: np.ndarray, among: np.ndarray | None = None)
     chosen = at_wall[faces.owner] | at_wall[np.maximum(faces.neighbor, 0)]
     made = collapse_short(diagram.faces, diagram, narrow_faces(diagram.faces, sizes, among), chosen)
     row = np.full(len(diagram.neighbors), -1)
-    row[diagram.faces.half_face] = faces.half_face
-    return replace(made, half_face=row[made.half_face])
+    row[diagram.faces.half_face] = np.arange(len(faces))
+    before = row[made.half_face]
+    changed = np.diff(made.starts) != np.diff(faces.starts)[before]
+    kept = np.flatnonzero(~changed)
+    starts, corners = take_rows(made.starts, made.corners, kept)
+    same = made.points[corners] == faces.points[take_rows(faces.starts, faces.corners, before[kept])[1]]
+    changed[kept] = ~np.logical_and.reduceat(same.all(axis=1), starts[:-1])
+    return replace(made, half_face=faces.half_face[before]), cells_of(made, changed)
 
 
 def _simplify(walls: np.ndarray, near: NearWalls, rejected: np.ndarray) -> None:
