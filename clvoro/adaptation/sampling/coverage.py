@@ -42,6 +42,8 @@ class FullCoverage:
 
     correction: np.ndarray | float = 1.0
     """By what the last split has changed the shares of the boxes that it split, (c,): 1 if they are exact."""
+    filling: float = 1.0
+    """Share of the first boxes that must be inside: half of them in a solid, where boxes at walls take long."""
 
     def __init__(self, boxes: BoxTree):
         self.boxes = boxes
@@ -144,6 +146,8 @@ class SolidCoverage(CutCoverage):
     inner : (m, d) float
         A point inside the domain and the box, for cut boxes with a share.
     """
+
+    filling = 0.5
 
     def __init__(self, boxes: BoxTree, domain: Domain):
         super().__init__(boxes, domain)

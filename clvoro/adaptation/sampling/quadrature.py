@@ -103,7 +103,7 @@ class DensityTree:
         self.field, self._domain, self.boxes = field, domain, BoxTree(domain)
         self.coverage = coverage_of(self.boxes, domain)
         dim = domain.dim
-        least = _BASE[dim] >> domain.curved_walls  # a solid does not fill its bounding box
+        least = self.coverage.filling * _BASE[dim]
         while np.count_nonzero(self.coverage.occupied) << dim < least and len(self.boxes) << dim < _MAX_BASE[dim]:
             self.coverage.split(self.coverage.occupied)
         m = len(self.boxes)
