@@ -36,12 +36,13 @@ import tempfile
 import time
 import traceback
 import warnings
+from collections.abc import Callable
 from itertools import product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from _common import Report, counts, heading, make_adapter, names, parser
+from _common import CUBE, Report, counts, heading, make_adapter, names, parser
 from _openfoam import require
 from _solid_shapes import SHAPES, random_part, solid_of
 from solver_ready import COLUMNS as PLANE_COLUMNS
@@ -269,6 +270,15 @@ SPEED_COLUMNS = {
 }
 
 
+DOMAINS: dict[str, Callable[[], Any]] = {
+    "box": lambda: CUBE,
+    "cube": lambda: clvoro.Solid.box((0, 0, 0), (1, 1, 1)),
+    "body": lambda: clvoro.Solid.outside(wavy_body(), CUBE),
+}
+"""Domains of which speeds are compared."""
+RUNS = ("fast", "default", "best", "exact")
+
+
 def measure_speed(adapter: clvoro.Adapter, n: int, chosen: list[str], report: Report) -> None:
     """Add rows of processor times with `n` cells in a box, in the same cube as a solid, and around a body in it."""
     begun: list[float] = []
@@ -276,14 +286,9 @@ def measure_speed(adapter: clvoro.Adapter, n: int, chosen: list[str], report: Re
     def steps(status: Any) -> None:
         begun[1:] = [time.process_time()]
 
-    cube, base = clvoro.Box((0, 0, 0), (1, 1, 1)), 0.0
-    domains = {
-        "box": lambda: cube,
-        "cube": lambda: clvoro.Solid.box((0, 0, 0), (1, 1, 1)),
-        "body": lambda: clvoro.Solid.outside(wavy_body(), cube),
-    }
-    for name in chosen or domains:
-        domain = domains[name]()
+    base = 0.0
+    for name in chosen or DOMAINS:
+        domain = DOMAINS[name]()
         adapter.run(domain, 0.2, "fast").diagram.faces.area.sum()  # builds the programs
         begun[:] = [time.process_time()]
         result = adapter.run(domain, (domain.measure / n) ** (1 / 3), callback=steps)
@@ -363,8 +368,16 @@ def main() -> None:
     options_of.add_argument("--pictures", type=Path, metavar="FOLDER")
     options_of.add_argument("--order", default="", metavar="SIZES", help="errors of volume and area at these sizes")
     options_of.add_argument("--layers", default="", metavar="LAYERS", help="thickness / h:count:growth, as 0.5:5:1.3")
-    options_of.add_argument("--domains", default="", metavar="NAMES", help="of --speed: box, cube, body")
+    options_of.add_argument("--domains", default="", metavar="NAMES", help=f"of --speed: {', '.join(DOMAINS)}")
     options = options_of.parse_args()
+    for what, given, known in (
+        ("solid", () if options.booleans else names(options.only), SHAPES),
+        ("resolution", names(options.resolutions), ("0", "1")),
+        ("run", names(options.runs), RUNS),
+        ("domain", names(options.domains), DOMAINS),
+    ):
+        if unknown := [name for name in given if name not in known]:
+            options_of.error(f"no {what} {', '.join(unknown)}; there are {', '.join(known)}")
     if options.order:
         adapter, report = make_adapter(options), Report(options.json, ORDER_COLUMNS)
         measure_order(adapter, [float(h) for h in names(options.order)], names(options.runs), report)
