@@ -13,7 +13,7 @@ import clvoro
 from clvoro import sizing
 from clvoro.adaptation.diagnostics import layer_mismatches, warn_of_narrow_parts
 from clvoro.cli import command as cli
-from clvoro.errors import CoarseSizeWarning, InputError, MismatchWarning, SizeErrorWarning
+from clvoro.errors import CoarseSizeWarning, MismatchWarning, SizeErrorWarning
 
 BOX = clvoro.Box((0, 0), (2, 1))
 CUBE = clvoro.Box((0, 0, 0), (1, 1, 1))
@@ -156,11 +156,6 @@ def test_far_shapes_are_detected_safely():
     assert 20 < said < 280
 
 
-def test_data_outside_of_their_box_are_rejected():
-    with pytest.raises(InputError, match="all outside of the box"):
-        sizing.Scattered(SPREAD * 1000 + 5, SPREAD[:, 0] + 1, BOX.lower, BOX.upper)
-
-
 @pytest.mark.parametrize(
     ("layer", "size", "message"),
     [
@@ -240,13 +235,6 @@ def test_degrees_are_warned_of_however_they_come(adapter, make):
         warnings.simplefilter("error", MismatchWarning)
         make(RING)  # it may be an area on a sphere
         adapter.run(make(PLAN), 0.8, max_steps=0)
-
-
-def test_degrees_with_sizes_in_meters(ctx):
-    with pytest.warns(MismatchWarning):
-        domain = clvoro.Polygon.from_geojson(lake(46.2, None))
-    with pytest.warns(CoarseSizeWarning, match="longitudes and latitudes"):
-        clvoro.Adapter(ctx).run(domain, 100.0, max_steps=0)
 
 
 CASE = """[domain]

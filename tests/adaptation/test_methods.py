@@ -208,18 +208,6 @@ def test_mean_log_ratio_error_of_perfect_cells(stages):
     assert np.isfinite(method.penalty)
 
 
-@pytest.mark.sparse(1)
-@pytest.mark.parametrize("value", ["-0.02", "0.0", "0.0/0.0"])
-def test_invalid_size_is_reported_as_in_the_field(stages, value):
-    """On a coarse level h is a multiple of the field."""
-    field = sizing.Expression(f"x > 0.7 && y > 0.5 ? {value} : 0.05")
-    points = np.array([[0.2, 0.3], [0.8, 0.6], [0.5, 0.1]])
-    engine = stages.engine
-    printed = {"0.0": "0", "0.0/0.0": "nan"}.get(value, value)
-    with pytest.raises(SizeFieldError, match=rf"is -?{printed} at \(0\.8, 0\.6\)"):
-        MeshState.create(stages, patch.BOX, Sizing(engine, patch.BOX, field), engine.upload(points), size_factor=8)
-
-
 def test_updates_check_sizes(stages):
     engine, good = stages.engine, np.array([[0.2, 0.3], [0.6, 0.6], [0.5, 0.1]])
     size = Sizing(engine, patch.BOX, sizing.Expression("x > 0.7 ? 0.0/0.0 : 0.05"))

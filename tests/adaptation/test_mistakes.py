@@ -150,9 +150,7 @@ def test_accepted_points(adapter, make):
 @pytest.mark.parametrize(
     ("make", "parts"),
     [
-        (lambda: clvoro.Polygon(Geographic()), ("from_geojson",)),
         (lambda: clvoro.Polygon(np.ma.masked_equal(np.array(SQUARE), 1)), ("masked",)),
-        (lambda: clvoro.Polygon.from_pieces([[SQUARE], [SQUARE]]), ("outer-2", "repeats")),
         (lambda: clvoro.Polygon(SQUARE).boundary([]), ("at least one",)),
     ],
 )

@@ -66,9 +66,6 @@ def test_one_direction_with_walls(ctx):
         ([], None, InputError, "holes is empty"),
         (3, None, InputTypeError, "expected a list of rings"),
         ([[(0, 0), (1, 1)]], None, InputError, r"holes\[0\]: "),
-        ([TUBE, [(1.9, 0.9), (1.95, 0.9), (1.95, 0.95)]], None, InputError, r"holes\[0\] touches holes\[1\]"),
-        ([clvoro.curves.circle((1, 0.5), 0.5)], None, InputError, "its own image"),
-        ([TUBE], {"xMin": 0}, InputError, "side of the box"),
         ([TUBE], {"tube": 1}, InputError, "hole 1"),
     ],
 )
@@ -86,24 +83,3 @@ def test_holes_in_a_case():
     for one in (case, Case.from_toml(write_toml(case.table), "my.toml")):
         assert one.domain.holes.describe() == wanted.holes.describe()
         assert one.domain.holes.parts.names == ("tube", "hole-2")
-
-
-def test_what_does_not_go_with_holes_is_said(ctx):
-    adapter, domain = clvoro.Adapter(ctx), BOTH.without([TUBE])
-    with pytest.raises(InputError, match="make the box periodic along y"):
-        clvoro.Box((0, 0), (2, 1), (True, False)).without([TUBE])
-    with pytest.raises(InputError, match=r"write clvoro[.]Polygon"):
-        clvoro.Box((0, 0), (2, 1)).without([TUBE])
-    with pytest.raises(InputError, match="give all holes at"):
-        domain.without([WEDGE])
-    for call in (
-        lambda: domain.with_lines([[(0.5, 0.5), (1.5, 0.5)]]),
-        lambda: adapter.diagram(domain, [(1, 0.5)]),
-        lambda: adapter.run(domain, 0.1, n_cells=100),
-        lambda: adapter.transport(domain, [(1, 0.5)], [2.0]),
-    ):
-        with pytest.raises(InputError, match="does not go with the holes"):
-            call()
-    thin = BOTH.without([[(0.5, 0.5), (1.5, 0.48), (1.5, 0.52)]])
-    with pytest.raises(InputError, match="make the corner blunt"):
-        adapter.run(thin, 0.1, "fast")

@@ -224,11 +224,6 @@ def test_unknown_case_names_the_nearest():
         load_case("papre")
 
 
-def test_missing_raster_is_named(tmp_path):
-    with pytest.raises(InputError, match=r"size\.file.*absent\.npy"):
-        field("[size]\nkind = 'raster'\nfile = 'absent.npy'", tmp_path)
-
-
 # --- writing -------------------------------------------------------------------------------------
 
 

@@ -6,9 +6,7 @@ from scipy.spatial import ConvexHull, Delaunay
 
 import clvoro
 from clvoro.earth.c_grid import measure_c_grid
-from clvoro.errors import InputError
 from tests.mesh.test_sphere_check import icosahedron, scattered
-from tests.reference.solids import solid_diagram
 
 RADIUS = 3.0
 
@@ -190,15 +188,6 @@ def test_box_with_walls(ctx):
     assert not m.length_ratio[walls].any()
 
 
-def test_other_domains_are_refused():
-    points = np.random.default_rng(8).random((20, 3))
-    solid = solid_diagram((0, 0, 0), (1, 1, 1), points)
-    with pytest.raises(InputError, match="on a Sphere and in the plane"):
-        _ = solid.measures.c_grid
-    with pytest.raises(InputError, match="on a Sphere and in the plane"):
-        solid.check(solver="mpas")
-
-
 def test_convex_polygons_are_as_boxes(ctx):
     points = np.random.default_rng(8).random((60, 2))
     boxes = clvoro.Box((0, 0), (1, 1)), clvoro.Polygon([(0, 0), (1, 0), (1, 1), (0, 1)])
@@ -275,8 +264,3 @@ def test_squares_warn_of_four_cells_at_a_vertex(ctx):
     assert report
     assert report["cells at a vertex"].count == 25
     assert report.faces == 50
-
-
-def test_walls_are_for_openfoam_only(globe):
-    with pytest.raises(InputError, match="walls is 'exact', and solver 'mpas'"):
-        globe.check(solver="mpas", walls="exact")

@@ -196,13 +196,6 @@ def test_a_plate_thinner_than_a_cell_keeps_its_cells(ctx):
     assert thin[1] < 0.25 * len(x)
 
 
-def test_a_single_cell_is_refused(ctx):
-    """It has no neighbor whose face could end at the walls."""
-    solid, x, h = clvoro.Solid.box((0, 0, 0), (H, H, H)), np.full((1, 3), H / 2), np.full(1, H)
-    with pytest.raises(clvoro.errors.InputError, match="too thin for cells of this size: 1 generators have no cell"):
-        solid_diagram(WallSurface(solid), x, h, whole_faces(ctx, solid, x, h))
-
-
 def l_cell(ctx):
     """Return the cures of an L whose crease passes through cells without stations, and one of these cells."""
     solid, x = el(), generators(el())

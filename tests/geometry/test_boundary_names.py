@@ -262,7 +262,6 @@ SQUARE = [(0, 0), (1, 0), (1, 1), (0, 1)]
         ({"a": [0, 1], "b": [1]}, InputError, "edge 1 both in 'a' and in 'b'"),
         ({"a": []}, InputError, "empty"),
         ({"a": "b"}, InputError, "name of a boundary: outer"),
-        ({"outer": [0]}, InputError, "which other edges already have"),
         ({"a b": 0}, InputError, "name 'a b'"),
         ({"": 0}, InputError, "name ''"),
         ({"ä": 0}, InputError, "name 'ä'"),

@@ -59,13 +59,11 @@ def test_lines_are_read_from_a_file_and_polygons_are_rings(tmp_path):
 @pytest.mark.parametrize(
     ("domain", "source", "message"),
     [
-        (BOX, [(3, 3), (4, 4)], "outside of"),
         (BOX, [(0.5, 0.5)], "single point"),
         (BOX, [(0.5, np.nan), (1, 1)], "finite"),
         (BOX, 3, "expected points"),
         (BOX, shapely.Point(1, 1), "a Point"),
         (BOX, {"type": "Point", "coordinates": [1, 1]}, "a Point"),
-        (clvoro.Box((0, 0, 0), (1, 1, 1)), FAULT, "3D"),
     ],
 )
 def test_what_is_no_line_in_the_domain_is_refused(domain, source, message):

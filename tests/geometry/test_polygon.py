@@ -10,7 +10,6 @@ import shapely
 
 import clvoro
 from clvoro.errors import InputError, InputTypeError
-from clvoro.geometry.domain import LARGEST_EDGE
 from tests.reference.polygons import HOLE, OTHER, SQUARE, crossings, distances, ragged
 
 
@@ -176,46 +175,22 @@ PIECES = lambda *rings: lambda: clvoro.Polygon.from_pieces([[r] for r in rings])
 @pytest.mark.parametrize(
     ("make", "says"),
     [
-        (ONE((0, 0), (2, 2), (2, 0), (0, 2)), r"Self-intersection at \(1, 1\), edge 0 of the outer ring"),
-        (ONE((0, 0), (2, 0), (1, 0), (1, 2)), r"Self-intersection"),
-        (ONE((0, 0), (4, 0), (4, 1), (6, 1), (4, 1), (4, 3), (0, 3)), r"\(6, 1\), edge \d of the outer ring"),
-        (ONE((0, 0), (4, 0), (4, 1), (2, 1), (4, 1), (4, 3), (0, 3)), r"\(4, 1\), edge \d of the outer"),
         (ONE((0, 0), (1, 0), (float("nan"), 1)), r"outer ring has vertex 2 at \(nan, 1\), expected finite"),
-        (ONE((0, 0), (1, 0)), "outer ring has 2 distinct vertices, expected at least 3"),
-        (ONE((0, 0), (1, 0), (1, 0), (0, 0)), "outer ring has 2 distinct vertices"),
         (ONE((0, 0), (1, 1), (3, 3)), r"on the line from \(0, 0\) to \(3, 3\), expected a ring with an area"),
-        (ONE((0, 0), (1, 0), (1, 1), (1, 1 + 2e-13), (0, 1)), r"length \S+e-13 at vertex 2, \(1, 1\)"),
-        (ONE((0, 0), (LARGEST_EDGE * 2, 0), (0, LARGEST_EDGE)), "choose another unit of length"),
-        (ONE((0, 0), (0.5 / LARGEST_EDGE, 0), (0, 0.5 / LARGEST_EDGE)), "choose another unit"),
-        (ONE((1e12, 0), (1e12 + 0.5, 0), (1e12, 0.5)), "move it to the origin"),
         (ONE((0, 0, 0), (1, 0, 0), (1, 1, 0)), r"outer ring has shape \(3, 3\), expected \(n, 2\)"),
         (ONE((0, 0), (1, 0), (1,)), "outer ring is not an array"),
         (ONE(("a", "b"), ("c", "d"), ("e", "f")), "outer ring has dtype"),
-        (ONE(), "outer ring has 0 distinct vertices"),
-        (SQUARE_HOLES(HOLE + 9), r"Hole lies outside shell at \(10, 10\), edge 0 of hole-1"),
-        (SQUARE_HOLES(HOLE, HOLE + 0.5), r"edge \d of hole-1 and edge \d of hole-2"),
-        (SQUARE_HOLES(HOLE, HOLE / 2 + 0.75), r"Holes are nested at \S+ \S+, edge \d of hole-2"),
-        (SQUARE_HOLES(HOLE + np.array([2, 0])), r"edge 1 of the outer ring and edge \d of hole-1"),
-        (SQUARE_HOLES([(0, 1), (2, 1), (4, 1), (2, 2)]), "Interior is disconnected"),
-        (SQUARE_HOLES(HOLE, [(1, 1), (2, 3), (1, 2)]), "hole-2"),
-        (PIECES(SQUARE, SQUARE + 1), r"edge \d of outer-1 and edge \d of outer-2"),
-        (PIECES(SQUARE, HOLE), "Nested shells"),
-        (PIECES(SQUARE, SQUARE + np.array([4, 0])), "Self-intersection at"),
         (lambda: clvoro.Polygon.from_pieces([]), "no rings"),
         (lambda: clvoro.Polygon.from_pieces([[]]), "no rings for piece 1"),
         (lambda: clvoro.Polygon.from_pieces([clvoro.Polygon(SQUARE)]), "piece 1 is a Polygon, expected a list of its"),
         (lambda: clvoro.Polygon(SQUARE, 3), "holes is a int"),
         (lambda: clvoro.Polygon.from_wkt("POLYGON ((0 0, 1"), "not well-known text"),
         (lambda: clvoro.Polygon.from_wkt("POLYGON EMPTY"), "empty Polygon"),
-        (lambda: clvoro.Polygon.from_wkt("POINT (1 1)"), "geometry is a Point"),
         (lambda: clvoro.Polygon.from_wkt(3), "text is a int"),
-        (lambda: clvoro.Polygon.from_shapely(SQUARE), "geometry is a ndarray"),
         (lambda: clvoro.Polygon.from_geojson(3), "source is a int"),
         (lambda: clvoro.Polygon.from_geojson("missing.geojson"), "cannot read missing.geojson"),
         (lambda: clvoro.Polygon.from_geojson("{"), "not JSON"),
         (lambda: clvoro.Polygon.from_geojson({}), "expected an object with a type"),
-        (lambda: clvoro.Polygon.from_geojson({"type": "Point", "coordinates": [1, 2]}), "has a 'Point'"),
-        (lambda: clvoro.Polygon.from_geojson({"type": "Feature", "geometry": None}), "without geometry"),
         (lambda: clvoro.Polygon.from_geojson({"type": "FeatureCollection", "features": []}), "no Polygon"),
         (lambda: clvoro.Polygon.from_geojson({"type": "Polygon", "coordinates": 3}), "coordinates 3"),
         (lambda: clvoro.Polygon.from_geojson({"type": "Polygon", "coordinates": [3]}), "the ring 3"),

@@ -282,24 +282,12 @@ def test_thickness_is_the_callers(plane, tmp_path):
         ({"types": ["wall"]}, "types is .* of type list, expected a mapping"),
         ({"thickness": 0}, "thickness is 0, expected a finite number > 0"),
         ({"thickness": "thin"}, "thickness is 'thin'"),
-        ({"patches": {"front": 0}}, "boundary 'front' has the name of a patch that OpenFOAM needs"),
     ],
 )
 def test_wrong_options_are_refused(plane, tmp_path, options, says):
     with pytest.raises((InputError, InputTypeError), match=says):
         plane.to_openfoam(tmp_path / "polyMesh", **options)
     assert not list(tmp_path.iterdir())
-
-
-def test_options_of_other_meshes_and_formats_are_refused(solid, plane, tmp_path):
-    with pytest.raises(InputError, match="thickness is for meshes in 2D"):
-        solid.to_openfoam(tmp_path / "polyMesh", thickness=1.0)
-    for option in ({"types": {}}, {"thickness": 1}, {"patches": {}}, {"binary": True}):
-        with pytest.raises(InputError, match=f"with {next(iter(option))}, which is for OpenFOAM"):
-            io.write(plane, tmp_path / "mesh.vtu", **option)
-    for option in ({"units": "m"}, {"convention": "mpas"}):
-        with pytest.raises(InputError, match=f"with {next(iter(option))}, which is for netCDF"):
-            io.write(plane, tmp_path / "mesh.vtu", **option)
 
 
 def test_failure_leaves_the_old_mesh(solid, tmp_path, monkeypatch):

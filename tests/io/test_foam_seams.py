@@ -10,7 +10,6 @@ import pytest
 
 import clvoro
 from clvoro import io
-from clvoro.errors import InputError
 from tests.io.test_foam import check_mesh, needs_openfoam, read
 from tests.reference import solids
 
@@ -113,14 +112,6 @@ def test_only_walls_are_patches(result, mesh):
         corners = sorted({v for f in faces[start : start + size] for v in f})
         assert size > 0
         assert points[corners, axis] == pytest.approx(plane, abs=1e-14)
-
-
-def test_names_of_cyclic_patches_are_reserved(ctx, tmp_path):
-    box = clvoro.Box((0, 0), (1, 1), periodic=(True, False), names={"xMin": "yMin"})
-    points = np.random.default_rng(2).random((30, 2))
-    diagram = clvoro.Adapter(ctx).diagram(box, points)
-    with pytest.raises(InputError, match="boundary 'xMin' has the name of a patch"):
-        io.foam.poly_mesh(diagram)
 
 
 @pytest.mark.sparse(2)

@@ -12,7 +12,7 @@ from scipy.io import netcdf_file
 import clvoro
 from clvoro.errors import InputError, InputTypeError
 from clvoro.io import netcdf
-from tests.reference import netcdf_files, solids
+from tests.reference import netcdf_files
 from tests.reference.netcdf_files import MESHES, made, read, result_of, shoelace
 
 BOTH = ("ugrid", "mpas")
@@ -262,26 +262,6 @@ def test_ugrid_is_the_default(room, tmp_path):
 def test_other_conventions_are_refused(room, tmp_path, convention):
     with pytest.raises(InputError, match=r"convention is .*expected one of 'ugrid', 'mpas', 'scrip'"):
         room.to_netcdf(tmp_path / "mesh.nc", convention=convention)
-    assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.parametrize("name", ["mesh.vtu", "mesh.npz", "mesh.vtk", "case.foam", "polyMesh"])
-def test_conventions_are_for_netcdf_alone(room, tmp_path, name):
-    with pytest.raises(InputError, match=rf"{name} with convention.*netCDF; save as \.nc"):
-        clvoro.io.write(room, tmp_path / name, convention="mpas")
-    with pytest.raises(InputError, match=rf"{name} as netCDF, expected a name that ends in \.nc"):
-        room.to_netcdf(tmp_path / name, convention="mpas")
-    with pytest.raises(InputError, match="with patches, which is for OpenFOAM"):
-        clvoro.io.write(room, tmp_path / "mesh.nc", patches={"a": [0]})
-    assert not list(tmp_path.iterdir())
-
-
-def test_meshes_in_3d_are_refused(tmp_path):
-    points = np.random.default_rng(1).random((20, 3))
-    solid = solids.solid_result(solids.solid_diagram((0, 0, 0), (1, 1, 1), points))
-    for convention in BOTH:
-        with pytest.raises(InputError, match=r"3 dimensions.*\.vtu, \.foam or \.npz"):
-            solid.to_netcdf(tmp_path / "mesh.nc", convention=convention)
     assert not list(tmp_path.iterdir())
 
 

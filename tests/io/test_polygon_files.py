@@ -428,7 +428,6 @@ def test_openfoam_patches(pond, tmp_path) -> None:
         ({"a": []}, r"patches\['a'\] is empty"),
         ({"a": [1], "b": [0, 1]}, "edge 1 both in 'a' and in 'b'"),
         ({"a b": [1]}, "the name 'a b'"),
-        ({"outer": [1]}, "the name 'outer', which other edges already have"),
         ([0, 1], r"patches is \[0, 1\] of type list.*'inlet': \[0, 1\]"),
         ({"a": [0.5]}, r"patches\['a'\] is \[0\.5\]"),
         ({"a": "01"}, r"patches\['a'\] is '01'"),

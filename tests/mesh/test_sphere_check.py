@@ -5,7 +5,6 @@ import pytest
 from scipy.spatial import SphericalVoronoi
 
 import clvoro
-from clvoro.errors import InputError
 from clvoro.mesh.check.rebuilt import SphereCells, find_precision
 from clvoro.mesh.diagram import Diagram
 from tests.mesh.test_check import add, names_of, of_diagram, put, spoilt, swap
@@ -239,8 +238,3 @@ def test_diagram_from_corners_alone_passes(result):
     report = Diagram(d.domain, arrays).check()
     assert report, report
     assert "volumes of the generators" not in report.checked
-
-
-def test_openfoam_has_no_meshes_on_a_sphere(result):
-    with pytest.raises(InputError, match=r"on Sphere.*solver='mpas'"):
-        result.check(solver="openfoam")

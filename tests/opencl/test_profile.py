@@ -197,11 +197,6 @@ def test_callback_still_stops_the_run(adapter):
     assert [s.step for s in taken.spans] == [0, 1, 2, None]
 
 
-def test_queue_without_profiling_raises(ctx):
-    with pytest.raises(InputError, match="profiled_queue"):
-        Profile(cl.CommandQueue(ctx))
-
-
 def test_open_profile_has_no_table(engine):
     with Profile(engine.queue) as taken:
         for figures in (taken.table, taken.as_dict):

@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 
 import clvoro
 from clvoro.errors import ClvoroError, InputError, MissingPicturesWarning
-from clvoro.plotting import globe, map_projection, plot_cells, plot_globe, plot_slice, write_report
+from clvoro.plotting import globe, map_projection, plot_globe, write_report
 from clvoro.plotting.colors import kilometer_of
 from clvoro.plotting.globe import default_center, outlines, project_cells
 from clvoro.plotting.pictures import pictures_of
@@ -188,29 +188,14 @@ def test_other_projections_and_maps_of_the_caller(mesh):
         ({"center": "here"}, "center is 'here'"),
         ({"across": 0}, "across is 0, expected a finite number > 0"),
         ({"across": 200}, "across is 200, expected an angle of at most 180 degrees"),
-        ({"across": 10, "projection": "plate"}, "across is for projection='orthographic'"),
-        ({"window": ((0, 0), (1, 1))}, "window is for projection='plate'"),
         ({"window": ((0, 0), (-1, 1)), "projection": "plate"}, "expected two corners"),
         ({"window": 3, "projection": "plate"}, "expected two corners"),
         ({"view": "slice"}, "view is 'slice', expected one of globe for this mesh"),
-        ({"cut": None}, "cut is an option of the view cutaway; the view globe has ax, projection"),
     ],
 )
 def test_bad_options(mesh, options, message):
     with pytest.raises(InputError, match=message):
         mesh.plot(**options)
-
-
-def test_other_pictures_refuse(mesh, adapter):
-    with pytest.raises(InputError, match=r"call result\.plot"):
-        plot_cells(mesh)
-    with pytest.raises(InputError, match="need cells in 3D"):
-        plot_slice(mesh)
-    plane = adapter.diagram(clvoro.Box((0, 0), (1, 1)), [(0.2, 0.3), (0.7, 0.6)])
-    with pytest.raises(InputError, match="draws meshes on a sphere"):
-        plot_globe(plane)
-    with pytest.raises(InputError, match="projection is an option of the view globe; the view cells has"):
-        plane.plot(projection="plate")
 
 
 @pytest.mark.sparse(1)

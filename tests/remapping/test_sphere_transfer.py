@@ -8,7 +8,6 @@ import pytest
 import shapely
 from scipy.spatial import KDTree, SphericalVoronoi
 
-import clvoro
 from clvoro import Sphere
 from clvoro.errors import InputError
 from clvoro.mesh.diagram import Diagram
@@ -267,16 +266,6 @@ def test_small_cells_keep_their_digits(adapter):
     exact = (new.centroids - center) @ slope
     # The sphere leaves its tangent plane by |u|^2 / 2, and a centroid on the sphere is not that in space.
     np.testing.assert_allclose(got[inner], exact[inner], rtol=0, atol=1e-12)
-
-
-def test_other_domains_are_rejected(mesh, adapter):
-    old, plane = mesh(9, 1), adapter.diagram(clvoro.Box((0, 0), (1, 1)), [[0.5, 0.5]])
-    with pytest.raises(InputError, match=r"Sphere\(radius=2.0\), .* Sphere\(radius=1.0\); expected one radius"):
-        old.transfer(np.ones(9), mesh(8, 2, 2.0))
-    with pytest.raises(InputError, match=r"onto is a mesh of Box.* are on Sphere.*expected meshes in one space"):
-        old.transfer(np.ones(9), plane)
-    with pytest.raises(InputError, match=r"onto is a mesh of Sphere.* are on Box.*expected meshes in one space"):
-        plane.transfer(np.ones(1), old)
 
 
 NAMES = ("volumes", "centroids", "neighbor_starts", "neighbors", "vertices", "cell_vertex_starts", "cell_vertices")

@@ -1,11 +1,9 @@
 """Unattended runs with broken streams, signals, full disks and forks: they continue, or name the remedy."""
 
 import contextlib
-import copy
 import errno
 import io
 import os
-import pickle
 import signal
 import subprocess
 import sys
@@ -22,15 +20,7 @@ from clvoro.adaptation import checkpoint
 from clvoro.adaptation.checkpoint import Saved
 from clvoro.cli import command as cli
 from clvoro.cli import outputs, progress
-from clvoro.errors import (
-    BuildError,
-    CheckpointWarning,
-    DeviceError,
-    InputError,
-    InputTypeError,
-    MemoryLimitError,
-    OutputError,
-)
+from clvoro.errors import BuildError, CheckpointWarning, DeviceError, InputError, MemoryLimitError, OutputError
 from clvoro.io import npz
 from clvoro.opencl import memory_limits
 from clvoro.opencl import runtimes as _runtimes
@@ -364,12 +354,6 @@ def test_forked_processes_are_told_that_they_cannot_work(ctx):
         assert told.read() == b"+" * len(attempts)
     os.waitpid(child, 0)
     assert result.diagram.vertices.shape[1] == 2  # the parent works on
-
-
-def test_adapters_are_not_copied(adapter):
-    for attempt in (copy.copy, copy.deepcopy, pickle.dumps):
-        with pytest.raises(InputTypeError, match=r"clvoro\.Adapter\(adapter\.ctx"):
-            attempt(adapter)
 
 
 def test_the_hosts_memory_ends(here, monkeypatch, capsys):

@@ -300,13 +300,6 @@ def test_many_neighbors_enlarge_the_capacity(adapter64, n):
     check_invariants(diagram, np.finfo(float).eps, 64)
 
 
-def test_too_many_neighbors_are_rejected(adapter64):
-    center = np.array([1.0, 0.75, 0.5])
-    points = np.concatenate([center + 0.4 * directions(900, np.random.default_rng(31)), [center]])
-    with pytest.raises(clvoro.ClvoroError, match="more than 512 faces"):
-        adapter64.diagram(BOX, points)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("real", ["float64", "float32"])
 def test_where_cells_are_clipped_changes_no_bit(ctx, real, monkeypatch):

@@ -5,7 +5,6 @@ import pytest
 
 import clvoro
 from clvoro.adaptation.moving.lattice import lattice_points, mirrored
-from clvoro.errors import InputError
 
 
 @pytest.mark.parametrize(
@@ -18,11 +17,6 @@ def test_cells_have_the_same_volume(adapter, box, n):
     volumes = adapter.diagram(box, points).volumes * n / box.measure
     assert np.abs(volumes - 1).mean() < 0.04
     assert 0.6 < volumes.min() < volumes.max() < 1.5
-
-
-def test_a_narrow_box_is_refused():
-    with pytest.raises(InputError, match="2 cells wide"):
-        lattice_points(clvoro.Box((0, 0), (10, 1)), 40)
 
 
 def test_mirror_images():
