@@ -190,23 +190,24 @@ def _is_new(what: str, device: cl.Device) -> bool:
 
 
 def _marker(what: str, device: cl.Device) -> Path | None:
-    """Return the file that says that `what` is in the cache of `device`; None if there is no cache."""
+    """Return the file that says that `what` is in the cache of `device`; None if there is no cache to write to."""
     if on_pocl(device) and os.environ.get("POCL_KERNEL_CACHE") == "0":
         return None
-    try:
+    with contextlib.suppress(OSError, RuntimeError):
         folder = cache_home()
-    except (OSError, RuntimeError):
-        return None
-    if on_pocl(device):
-        folder = Path(os.environ.get("POCL_CACHE_DIR") or folder / "pocl" / "kcache")
-    version = device.version, device.driver_version, device.name, what
-    return folder / "clvoro" / hashlib.sha256(repr(version).encode()).hexdigest()[:16]
+        if on_pocl(device):
+            folder = Path(os.environ.get("POCL_CACHE_DIR") or folder / "pocl" / "kcache")
+        folder /= "clvoro"
+        folder.mkdir(parents=True, exist_ok=True)
+        version = device.version, device.driver_version, device.name, what
+        if os.access(folder, os.W_OK):
+            return folder / hashlib.sha256(repr(version).encode()).hexdigest()[:16]
+    return None
 
 
 def _mark(marker: Path) -> bool:
     """Make the file `marker`; return whether it has not been there."""
     with contextlib.suppress(OSError):
-        marker.parent.mkdir(parents=True, exist_ok=True)
         marker.open("x").close()
         return True
     return False

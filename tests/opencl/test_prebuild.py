@@ -110,7 +110,7 @@ class Worker:
 @pytest.mark.parametrize("code", [0, 1])
 def test_optimized_kernels_replace_the_first_ones(engine, tmp_path, monkeypatch, code):
     """Also if a worker fails; then the next process begins again."""
-    worker, marker, texts, plain = Worker(), tmp_path / "folder" / "marker", [], cl.Program.build
+    worker, marker, texts, plain = Worker(), tmp_path / "marker", [], cl.Program.build
     mine = [program.program_text("opencl/primitives.cl", engine.all_defines("opencl/primitives", {}), "")]
     monkeypatch.setattr(program, "_programs", {})
     monkeypatch.setattr(program, "quick", set(mine))
