@@ -1006,6 +1006,7 @@ ROWS = [
 TESTED_IN = {
     "has one value in all cells of the latest time": "foam/test_foam_cases.py::test_bad_input_changes_nothing",
     "U enters the domain with": "foam/test_foam_cases.py::test_bad_input_changes_nothing",
+    "do not bound one layer of cells normal to z": "foam/test_foam_cases.py::test_bad_input_changes_nothing",
     "this process was forked": "robustness/test_unattended.py::test_forked_processes_are_told_that_they_cannot_work",
     "prisms, which need": "finite_volumes/test_prism_layers.py::test_prisms_that_memory_does_not_hold_are_refused",
     "points in the layers, expected": "finite_volumes/test_prism_layers.py::test_points_in_layers_only_are_refused",

@@ -275,6 +275,7 @@ class _Loop:
             return self.rows
         if not callable(solver):
             check_solver(solver)
+        self._check_mesh(mesh)
         length = self._interval(interval)
         check_writable(case.folder)
         make_folder(case.own)
@@ -295,6 +296,22 @@ class _Loop:
         if folder not in self.read:
             self.read = {folder: FoamMesh.read(folder)}
         return self.read[folder]
+
+    def _check_mesh(self, given: object) -> None:
+        """Raise InputError before the solver runs if its mesh cannot be followed by one of as many cells."""
+        folder = self.case.mesh_folder(self.case.latest())
+        foam = self._mesh_in(folder)
+        self._check_count(foam)
+        if given is None and not (folder / _MESH).exists():
+            foam.domain()
+
+    def _check_count(self, foam: FoamMesh) -> None:
+        least = _CELLS_PER_PATCH * len(foam.types)
+        if self.n_cells < least:
+            raise InputError(
+                f"n_cells is {self.n_cells}, expected at least {least}: {_CELLS_PER_PATCH} for each of the "
+                f"{len(foam.types)} patches"
+            )
 
     def _known(self, note: dict[str, Any]) -> FoamCycle | None:
         """Return the row of the latest solution; None if it is not in the report."""
@@ -374,12 +391,7 @@ class _Loop:
         foam, fields = old.foam, case.fields(latest)
         _check_values(fields, foam)
         check_fluxes(fields, foam)
-        least = _CELLS_PER_PATCH * len(foam.types)
-        if self.n_cells < least:
-            raise InputError(
-                f"n_cells is {self.n_cells}, expected at least {least}: {_CELLS_PER_PATCH} for each of the "
-                f"{len(foam.types)} patches"
-            )
+        self._check_count(foam)
         self._warn_of_lost_fields(fields, foam, latest)
         size = self._sizes_in_window(fields, old, latest)
         layers = tuple(_layers_of(note["layers"])) if self.layers is None else self.layers

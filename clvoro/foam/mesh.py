@@ -128,7 +128,15 @@ class FoamMesh:
                 f"the case has patches {', '.join(other)}, expected types {', '.join(known)}, or one layer of cells "
                 "between empty patches; cyclic patches are known if the mesh is one of clvoro that is passed as mesh="
             )
-        return self._polygon() if self.is_plane else self._solid()
+        if self.is_plane:
+            return self._polygon()
+        flat = [p.name for p in self.patches if p.kind == "empty" and len(p.faces)]
+        if flat:
+            raise InputError(
+                f"the empty patches {', '.join(flat)} do not bound one layer of cells normal to z, expected that; turn "
+                'the case, from y by transformPoints -rotate "((0 1 0) (0 0 1))" -rotateFields'
+            )
+        return self._solid()
 
     def _polygon(self) -> Polygon:
         ends, names = [], []

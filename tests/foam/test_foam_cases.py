@@ -377,6 +377,11 @@ def change_owner(case, n_less):
     path.write_text(f"FoamFile {{ format ascii; class labelList; }}\n{len(rows)}\n(\n{' '.join(map(str, rows))}\n)\n")
 
 
+def empty_body(case):
+    (case / "constant" / "polyMesh" / "clvoro.npz").unlink()
+    spoil(case, "constant/polyMesh/boundary", b"symmetry", b"empty")
+
+
 def nan_in_row_3(values):
     return np.where(np.arange(len(values))[:, None] == 3, np.nan, values)
 
@@ -395,6 +400,8 @@ def nan_in_row_3(values):
         (lambda c: None, {"cycles": 3}, InputError, "without a solver"),
         (lambda c: None, {"n_cells": 0}, InputError, "n_cells"),
         (lambda c: None, {"n_cells": 3}, InputError, "at least 16: 4 for each of the 4 patches"),
+        (lambda c: None, {"n_cells": 3, "solver": "true"}, InputError, "at least 16"),
+        (empty_body, {"solver": "true"}, InputError, "body.* do not bound one layer of cells normal to z"),
         (lambda c: None, {"solver": "noSuchFoam"}, InputError, "not on the PATH"),
         (lambda c: note(c, "{}"), {}, InputError, "the note of a cycle"),
         (lambda c: None, {"solver": "false"}, ClvoroError, "failed with code 1"),
