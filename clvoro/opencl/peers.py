@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
 Made = TypeVar("Made")
-PATIENCE, NAP = 200, 5e-5
+PATIENCE, NAP = 30, 2e-5
 """How often a rank asks for a message before it sleeps between two questions, and for how many seconds. Ranks may be
 more than cores."""
 ALARM = 1

@@ -28,8 +28,10 @@ from .part import Ghosts, Part
 from .stages import TessellationStages
 from .steps import DomainSteps, Sort
 
-FIRST_REACH = 2.5
-"""Radius of the first balls, in spacings of the generators around."""
+FIRST_REACH = 1.9, 2.4
+"""Radius of the first balls, in spacings of the generators around: for own cells; for those of neighbors, too."""
+JUMP = 3
+"""Spacings between two generators on the curve from which on a new box begins."""
 CHUNK, CHUNKS = 16, 512
 """Least number of generators in a box, and largest number of boxes, that say where the generators of a part are."""
 SLACK = 1.05
@@ -57,13 +59,23 @@ class Chunks:
         Generators along the curve.
     firsts : (k,) int
         Where the chunks begin in `order`.
+    spacings : (n,) float
+        Distances of generators that follow one another, in the median of those around.
     """
 
     def __init__(self, points: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> None:
         self.order = np.argsort(hilbert_keys(points, lower, upper), kind="stable")
         count = max(1, min(CHUNKS, len(points) // CHUNK))
-        self.firsts = np.arange(count) * len(points) // count
-        self._least = float(np.prod(upper - lower) / len(points)) ** (1 / len(lower)) / CHUNK
+        firsts = np.arange(count) * len(points) // count
+        ways = np.linalg.norm(np.diff(points[self.order], axis=0), axis=1)
+        least = float(np.prod(upper - lower) / len(points)) ** (1 / len(lower)) / CHUNK
+        usual = [max(float(np.median(some)), least) if len(some) else least for some in np.split(ways, firsts[1:])]
+        spacings = np.repeat(usual, np.diff(np.append(firsts, len(points))))
+        self.spacings = np.empty(len(points))
+        self.spacings[self.order] = spacings
+        # Generators may have left the others of their part.
+        jumps = 1 + np.flatnonzero(ways > JUMP * spacings[:-1])
+        self.firsts = np.unique(np.concatenate([firsts, jumps]))
         self.move(points)
 
     def move(self, points: np.ndarray) -> None:
@@ -75,15 +87,6 @@ class Chunks:
     def members(self, chunks: np.ndarray) -> np.ndarray:
         """Return the generators of those `chunks` where it is True."""
         return self.order[np.repeat(chunks, np.diff(np.append(self.firsts, len(self.order))))]
-
-    def spacings(self) -> np.ndarray:
-        """Return an estimate of the spacing at each generator, (n,)."""
-        dim, counts = self.boxes.shape[1] // 2, np.diff(np.append(self.firsts, len(self.order)))
-        wide = self.boxes[:, dim:] - self.boxes[:, :dim]
-        wide = np.maximum(wide, wide.max(axis=1, keepdims=True) / counts[:, None] ** (1 / dim))
-        found = np.empty(len(self.order))
-        found[self.order] = np.repeat((np.prod(wide, axis=1) / counts) ** (1 / dim), counts)
-        return np.maximum(found, self._least)
 
 
 def gaps2(points: np.ndarray, boxes: np.ndarray) -> np.ndarray:
@@ -153,7 +156,7 @@ class PartSteps(DomainSteps):
         self._labels, self._chunks = labels, Chunks(x, lower, upper)
         self._sent = [np.empty(0, np.int32) for _ in range(count)]
         self._parts, self._rows = np.empty(0, int), np.empty(0, np.int32)
-        self._caps = FIRST_REACH * self._chunks.spacings()
+        self._caps = FIRST_REACH[self._reads_rows] * self._chunks.spacings
         self._x = x
         self._meet()
         self._ask(x, self._caps, np.empty((0, engine.dim)), np.empty(0))
