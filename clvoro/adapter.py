@@ -208,7 +208,9 @@ class Adapter:
         return stages
 
     def diagram(self, domain: Domain, points: ArrayLike) -> Diagram:
-        """Return the Voronoi diagram of `points` in `domain`; also `clvoro.voronoi`.
+        """Return the Voronoi diagram of `points` in `domain`.
+
+        `clvoro.voronoi` uses the adapter that all calls share, on the best device.
 
         To have target sizes beside it, take no step from the points:
         ``clvoro.adapt(domain, size, points=points, method="lloyd", max_steps=0)``.
@@ -251,7 +253,9 @@ class Adapter:
             return make_diagram(stages, domain, host)
 
     def power_diagram(self, domain: Domain, points: ArrayLike, weights: ArrayLike) -> Diagram:
-        """Return the power diagram (Laguerre diagram) of `points` with `weights`; also `clvoro.power_diagram`.
+        """Return the power diagram (Laguerre diagram) of `points` with `weights` in `domain`.
+
+        `clvoro.power_diagram` uses the adapter that all calls share, on the best device.
 
         The cell of generator i is the set of y with ``|y - x_i|^2 - w_i <= |y - x_j|^2 - w_j`` for all j (Aurenhammer
         1987, SIAM J. Comput. 16, 78). Its faces are at right angles to the lines between generators, and a larger
@@ -310,7 +314,9 @@ class Adapter:
         max_steps: int = 100,
         relax: int = 0,
     ) -> Transported:
-        """Find the weights with which the cells of a power diagram have prescribed `volumes`; also `clvoro.transport`.
+        """Find the weights with which the cells of a power diagram have prescribed `volumes`.
+
+        `clvoro.transport` uses the adapter that all calls share, on the best device.
 
         These cells transport the volume of the domain to the generators at the least cost, the integral of the squared
         distance. Damped steps of Newton's method find them for any volumes that sum to that of the domain (Kitagawa,
