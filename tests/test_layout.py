@@ -53,7 +53,7 @@ UPWARD = {
     ("mesh.output", "finite_volumes"),
     ("mesh.output", "io"),
     ("mesh.output", "plotting"),
-    ("mesh.diagram", "remapping"),
+    ("mesh.output", "remapping"),
 }
 """Imports against the order, all inside methods of `Result`, `Diagram` and `Measures`: save, plot, check, transfer."""
 MOST_IN_ROOT, MOST_IN_PACKAGE = 12, 25

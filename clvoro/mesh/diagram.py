@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 
-from ..arguments import warn
-from ..errors import InputError, MismatchWarning
+from ..errors import InputError
 from ..opencl.probe import check_process
 from .output import MeshOutput
 from .read_only import read_only, seal
@@ -18,17 +17,14 @@ if TYPE_CHECKING:
     import scipy.sparse
     from numpy.typing import ArrayLike
 
-    from ..adapter import Adapter
     from ..finite_volumes.gate import Solver, SolverReport
     from ..finite_volumes.solver_mesh import WallShape
     from ..geometry.domain import Domain
     from .check.findings import Report
     from .faces import Faces
     from .half_faces import HalfFaceArrays
-    from .left_out import LeftOut
     from .lookup import Cell, Locator
     from .quality import Measures
-    from .results import Result
 
 
 class Diagram(MeshOutput):
@@ -211,6 +207,10 @@ class Diagram(MeshOutput):
     def __reduce__(self) -> tuple[Any, ...]:
         # Arrays that may still be on a device are read.
         return _rebuilt, (self.domain, {n: getattr(self, n) for n in self._arrays}), {"home": self.home}
+
+    @property
+    def _diagram(self) -> Diagram:
+        return self
 
     def __len__(self) -> int:
         return len(self.points)
@@ -418,22 +418,6 @@ class Diagram(MeshOutput):
 
         return measure_mesh(self)
 
-    @property
-    def left_out(self) -> LeftOut:
-        """What the mesh for solvers leaves out of a polygon or solid, or adds: measures and places of the parts.
-
-        They are bays, dead ends and islands, fins and cavities that cells are too large for. It makes the mesh; see
-        `solver_mesh`. Volumes of parts of solids are counted, to about 0.01 of a cell.
-
-        Examples
-        --------
-        >>> sea = clvoro.Polygon([(0, 0), (4, 0), (4, 4), (0, 4)], [[(2, 2), (2.1, 2), (2, 2.1)]])
-        >>> left = clvoro.adapt(sea, 0.7, "fast").left_out
-        >>> left.measures.round(3), np.abs(left.places - 2.03).max() < 0.03
-        (array([-0.005]), np.True_)
-        """
-        return self.solver_mesh().left_out
-
     @overload
     def check(self, solver: None = None, *, walls: WallShape | None = None) -> Report: ...
 
@@ -484,117 +468,7 @@ class Diagram(MeshOutput):
 
         return check_for_solver(self, solver, walls)
 
-    def transfer(
-        self,
-        values: ArrayLike,
-        onto: Result | Diagram,
-        order: int = 1,
-        *,
-        limited: bool = True,
-        covered: bool = False,
-        adapter: Adapter | None = None,
-    ) -> Any:
-        """Transfer cell data to another mesh, conservatively.
-
-        Both meshes have one domain, or domains that overlap: a globe and its ocean, a box and a lake in it. A new cell
-        that this mesh covers in part gets the mean over that part.
-
-        A new cell gets the mean over its intersections with the old cells. With `order` 1 a value is constant in an old
-        cell. With `order` 2 it is a linear function about the centroid. Its slope fits the values of the neighbors by
-        least squares, and is limited by Barth and Jespersen (AIAA 89-0366, 1989): at no corner of the cell does the
-        function exceed the values of cell and neighbors. On a sphere cells are intersected along great circles, and the
-        function is linear in the position.
-
-        Parameters
-        ----------
-        values : (n,) or (n, k) array of real numbers
-            Means over the cells of this mesh, in the order of its points.
-        onto : Result or Diagram
-            The new mesh.
-        order : 1 or 2
-        limited : bool
-            Whether slopes are limited. Without limits linear functions are exact up to round-off, at walls and extrema,
-            too, where a cell has d neighbors in different directions, but new values may exceed the old ones. On a
-            sphere they are then exact to the second order.
-        covered : bool
-            Whether to return the covered share of each new cell, too.
-        adapter : Adapter, optional
-            The adapter whose device does the work; by default that of `create_context()`. In float64 where the device
-            has it.
-
-        Returns
-        -------
-        (n_new,) or (n_new, k) float64
-            The mass, the sum of volume times value, is kept to 1e-12 of that of the absolute values. Every new value
-            lies between the least and the largest old value nearby (unless `limited` is False). A correction in
-            proportion to the distance from these bounds compensates the round-off of the mass. Between float32 meshes
-            the bounds take precedence: the mass of a constant differs as the sums of the volumes do. Between different
-            domains the mass in their common part is kept. Where this mesh covers nothing, the value is NaN.
-        (n_new,) float64
-            With `covered`, the share of each new cell that this mesh covers, from 0 to 1. Between meshes of one domain
-            it is 1. At the walls of a solid cells end at their own faces, and the share is that of their overlap
-            (0.97 to 1 in a ball of 500 to 8000 cells, ``bench/transfer.py --on ball``); the mass is kept all the same,
-            and a new cell that overlaps none has the value of the nearest old one.
-
-        Raises
-        ------
-        InputError, InputTypeError
-            If the meshes are in different spaces or have different periods, one has cells that a surface cuts in 3D,
-            `values` has another shape or is not finite, or `order` is neither 1 nor 2.
-        ClvoroError
-            If one of the meshes is not the Voronoi diagram of its points.
-
-        Warns
-        -----
-        MismatchWarning
-            If new cells are not covered, and `covered` is False; says how many.
-
-        Examples
-        --------
-        >>> box = clvoro.voronoi(clvoro.Box((0, 0), (2, 1)), [(0.5, 0.5), (1.5, 0.5)])
-        >>> shore = clvoro.Polygon([(0.5, 0.2), (2.5, 0.2), (2.5, 0.8), (0.5, 0.8)])
-        >>> lake = clvoro.voronoi(shore, [(1, 0.5), (2, 0.5)])
-        >>> values, share = box.transfer([1.0, 3.0], lake, covered=True)
-        >>> values.round(3).tolist(), share.round(3).tolist()
-        ([2.0, 3.0], [1.0, 0.5])
-        """
-        from ..remapping.cell_data import transfer_values
-
-        found, share, missing = transfer_values(self, values, onto, order, limited, adapter)
-        if covered:
-            return found, share
-        if missing:
-            warn(
-                f"{missing} of {len(share)} new cells are not covered by this mesh, or only in part, and have the "
-                "means over the covered parts, or NaN; pass covered=True for their covered shares",
-                MismatchWarning,
-            )
-        return found
-
     default_color = "quality"
-
-    def to_shapely(self) -> np.ndarray:
-        """Return the cells of a diagram in 2D, in a box or a polygon, as polygons of shapely.
-
-        Returns
-        -------
-        (n,) array of shapely.Polygon
-            Around the generators; in a periodic box the polygons are not cut at the seams. A cell around an island has
-            a hole. A cell may also be a MultiPolygon where it touches itself.
-
-        Raises
-        ------
-        InputError
-            In 3D, and on a sphere.
-
-        Examples
-        --------
-        >>> d = clvoro.voronoi(clvoro.Box((0, 0), (2, 1)), [(0.5, 0.5), (1.5, 0.5)])
-        >>> [cell.bounds for cell in d.to_shapely()]
-        [(0.0, 0.0, 1.0, 1.0), (1.0, 0.0, 2.0, 1.0)]
-        """
-        self.domain.require_plane("shapely has polygons in the plane", "use to_pyvista() or to_meshio()")
-        return self._shapes.copy()
 
     @cached_property
     def _shapes(self) -> np.ndarray:

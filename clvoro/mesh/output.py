@@ -8,11 +8,15 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypeVar, cast
 
 import numpy as np
 
+from ..arguments import warn
+from ..errors import MismatchWarning
+
 if TYPE_CHECKING:
     import meshio
     import pyvista
     from numpy.typing import ArrayLike
 
+    from ..adapter import Adapter
     from ..finite_volumes.solver_mesh import WallShape
     from ..geometry.boundary_names import Walls
     from ..geometry.domain import Domain
@@ -24,6 +28,7 @@ if TYPE_CHECKING:
     from ..plotting.pictures import View
     from .diagram import Diagram
     from .faces import Faces
+    from .left_out import LeftOut
     from .results import Result
 
 
@@ -38,6 +43,10 @@ class MeshOutput:
     @property
     def _self(self) -> Result | Diagram:
         return cast("Result | Diagram", self)
+
+    @property
+    def _diagram(self) -> Diagram:
+        raise NotImplementedError
 
     def subset(self: Mesh, keep: ArrayLike | Domain | Surface, boundary: str = "coast") -> Mesh:
         """Return the mesh without some of its cells, in a box, a polygon or a solid, or on a sphere.
@@ -110,7 +119,7 @@ class MeshOutput:
         >>> cells.boundary_cells("inlet").tolist()
         [2]
         """
-        diagram: Any = getattr(self._self, "diagram", self._self)
+        diagram = self._diagram
         walls = diagram.domain.boundaries.select("boundary", boundary)
         return np.unique(diagram.half_faces.owner[np.isin(-1 - diagram.neighbors, walls)])
 
@@ -333,8 +342,110 @@ class MeshOutput:
         """
         from ..finite_volumes.solver_mesh import make_solver_mesh
 
-        diagram: Any = getattr(self._self, "diagram", self._self)
-        return make_solver_mesh(diagram, walls, collapse)
+        return make_solver_mesh(self._diagram, walls, collapse)
+
+    @property
+    def left_out(self) -> LeftOut:
+        """What the mesh for solvers leaves out of a polygon or solid, or adds: measures and places of the parts.
+
+        They are bays, dead ends and islands, fins and cavities that cells are too large for. It makes the mesh; see
+        `solver_mesh`. Volumes of parts of solids are counted, to about 0.01 of a cell.
+
+        Examples
+        --------
+        >>> sea = clvoro.Polygon([(0, 0), (4, 0), (4, 4), (0, 4)], [[(2, 2), (2.1, 2), (2, 2.1)]])
+        >>> left = clvoro.adapt(sea, 0.7, "fast").left_out
+        >>> left.measures.round(3), np.abs(left.places - 2.03).max() < 0.03
+        (array([-0.005]), np.True_)
+        """
+        return self.solver_mesh().left_out
+
+    def transfer(
+        self,
+        values: ArrayLike,
+        onto: Result | Diagram,
+        order: int = 1,
+        *,
+        limited: bool = True,
+        covered: bool = False,
+        adapter: Adapter | None = None,
+    ) -> Any:
+        """Transfer cell data to another mesh, conservatively.
+
+        Both meshes have one domain, or domains that overlap: a globe and its ocean, a box and a lake in it. A new cell
+        that this mesh covers in part gets the mean over that part.
+
+        A new cell gets the mean over its intersections with the old cells. With `order` 1 a value is constant in an old
+        cell. With `order` 2 it is a linear function about the centroid. Its slope fits the values of the neighbors by
+        least squares, and is limited by Barth and Jespersen (AIAA 89-0366, 1989): at no corner of the cell does the
+        function exceed the values of cell and neighbors. On a sphere cells are intersected along great circles, and the
+        function is linear in the position.
+
+        Parameters
+        ----------
+        values : (n,) or (n, k) array of real numbers
+            Means over the cells of this mesh, in the order of its points.
+        onto : Result or Diagram
+            The new mesh.
+        order : 1 or 2
+        limited : bool
+            Whether slopes are limited. Without limits linear functions are exact up to round-off, at walls and extrema,
+            too, where a cell has d neighbors in different directions, but new values may exceed the old ones. On a
+            sphere they are then exact to the second order.
+        covered : bool
+            Whether to return the covered share of each new cell, too.
+        adapter : Adapter, optional
+            The adapter whose device does the work; by default that of `create_context()`. In float64 where the device
+            has it.
+
+        Returns
+        -------
+        (n_new,) or (n_new, k) float64
+            The mass, the sum of volume times value, is kept to 1e-12 of that of the absolute values. Every new value
+            lies between the least and the largest old value nearby (unless `limited` is False). A correction in
+            proportion to the distance from these bounds compensates the round-off of the mass. Between float32 meshes
+            the bounds take precedence: the mass of a constant differs as the sums of the volumes do. Between different
+            domains the mass in their common part is kept. Where this mesh covers nothing, the value is NaN.
+        (n_new,) float64
+            With `covered`, the share of each new cell that this mesh covers, from 0 to 1. Between meshes of one domain
+            it is 1. At the walls of a solid cells end at their own faces, and the share is that of their overlap
+            (0.97 to 1 in a ball of 500 to 8000 cells, ``bench/transfer.py --on ball``); the mass is kept all the same,
+            and a new cell that overlaps none has the value of the nearest old one.
+
+        Raises
+        ------
+        InputError, InputTypeError
+            If the meshes are in different spaces or have different periods, one has cells that a surface cuts in 3D,
+            `values` has another shape or is not finite, or `order` is neither 1 nor 2.
+        ClvoroError
+            If one of the meshes is not the Voronoi diagram of its points.
+
+        Warns
+        -----
+        MismatchWarning
+            If new cells are not covered, and `covered` is False; says how many.
+
+        Examples
+        --------
+        >>> box = clvoro.voronoi(clvoro.Box((0, 0), (2, 1)), [(0.5, 0.5), (1.5, 0.5)])
+        >>> shore = clvoro.Polygon([(0.5, 0.2), (2.5, 0.2), (2.5, 0.8), (0.5, 0.8)])
+        >>> lake = clvoro.voronoi(shore, [(1, 0.5), (2, 0.5)])
+        >>> values, share = box.transfer([1.0, 3.0], lake, covered=True)
+        >>> values.round(3).tolist(), share.round(3).tolist()
+        ([2.0, 3.0], [1.0, 0.5])
+        """
+        from ..remapping.cell_data import transfer_values
+
+        found, share, missing = transfer_values(self._diagram, values, onto, order, limited, adapter)
+        if covered:
+            return found, share
+        if missing:
+            warn(
+                f"{missing} of {len(share)} new cells are not covered by this mesh, or only in part, and have the "
+                "means over the covered parts, or NaN; pass covered=True for their covered shares",
+                MismatchWarning,
+            )
+        return found
 
     def plot(self, color: Color | ArrayLike | None = None, view: View | None = None, **options: Any) -> Any:
         """Draw the cells with Matplotlib.
@@ -377,6 +488,29 @@ class MeshOutput:
         from ..plotting import plot_mesh
 
         return plot_mesh(self._self, self.default_color if color is None else color, view, **options)
+
+    def to_shapely(self) -> np.ndarray:
+        """Return the cells in 2D, in a box or a polygon, as polygons of shapely.
+
+        Returns
+        -------
+        (n,) array of shapely.Polygon
+            Around the generators; in a periodic box the polygons are not cut at the seams. A cell around an island has
+            a hole. A cell may also be a MultiPolygon where it touches itself.
+
+        Raises
+        ------
+        InputError
+            In 3D, and on a sphere.
+
+        Examples
+        --------
+        >>> d = clvoro.voronoi(clvoro.Box((0, 0), (2, 1)), [(0.5, 0.5), (1.5, 0.5)])
+        >>> [cell.bounds for cell in d.to_shapely()]
+        [(0.0, 0.0, 1.0, 1.0), (1.0, 0.0, 2.0, 1.0)]
+        """
+        self._diagram.domain.require_plane("shapely has polygons in the plane", "use to_pyvista() or to_meshio()")
+        return self._diagram._shapes.copy()
 
     def to_pyvista(
         self, cell_data: Mapping[str, ArrayLike] | None = None, cut: bool = False

@@ -14,13 +14,9 @@ from .read_only import Sealed
 from .straightening import have_corners
 
 if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
-
-    from ..adapter import Adapter
     from ..finite_volumes.gate import Solver, SolverReport
     from ..finite_volumes.solver_mesh import WallShape
     from .check.findings import Report
-    from .left_out import LeftOut
     from .quality import Measures
 
 HISTORY_DTYPE = np.dtype(
@@ -178,23 +174,6 @@ class Result(Sealed, MeshOutput):
 
         return check_result(self)
 
-    def transfer(
-        self,
-        values: ArrayLike,
-        onto: Result | Diagram,
-        order: int = 1,
-        *,
-        limited: bool = True,
-        covered: bool = False,
-        adapter: Adapter | None = None,
-    ) -> Any:
-        """Transfer cell data (n,) or (n, k) to another mesh; see `Diagram.transfer`."""
-        return self.diagram.transfer(values, onto, order, limited=limited, covered=covered, adapter=adapter)
-
-    def to_shapely(self) -> np.ndarray:
-        """Return the cells of a mesh in 2D as polygons of shapely, (n,); see `Diagram.to_shapely`."""
-        return self.diagram.to_shapely()
-
     def summary(self) -> dict[str, Any]:
         """Return the figures that describe the mesh and the run.
 
@@ -221,14 +200,13 @@ class Result(Sealed, MeshOutput):
         return summary(self)
 
     @property
-    def left_out(self) -> LeftOut:
-        """What the mesh for solvers leaves out of a polygon or solid, or adds; see `Diagram.left_out`."""
-        return self.diagram.left_out
-
-    @property
     def measures(self) -> Measures:
         """Skewness, angles and ratios that matter to finite-volume methods; computed when first used."""
         return self.diagram.measures
+
+    @property
+    def _diagram(self) -> Diagram:
+        return self.diagram
 
     def __len__(self) -> int:
         """Return the number of cells."""
