@@ -12,7 +12,14 @@ import clvoro
 from clvoro.errors import InputError
 from clvoro.finite_volumes.solid_walls.cures import Cures
 from clvoro.finite_volumes.solid_walls.editing import judge
-from clvoro.finite_volumes.solid_walls.mesh import _Maker, diagram_of, off_middle, outer_generators, solid_diagram
+from clvoro.finite_volumes.solid_walls.mesh import (
+    _Maker,
+    _moved,
+    diagram_of,
+    off_middle,
+    outer_generators,
+    solid_diagram,
+)
 from clvoro.finite_volumes.solid_walls.near_walls import NearWalls
 from clvoro.finite_volumes.solid_walls.wall_surface import WallSurface
 from clvoro.mesh.connectivity import following
@@ -60,7 +67,7 @@ def made(request, ctx):
     solid = SOLIDS[request.param]()
     x = generators(solid)
     h = np.full(len(x), H)
-    diagram = solid_diagram(WallSurface(solid), x, h, whole_faces(ctx, solid, x, h))
+    diagram = solid_diagram(WallSurface(solid), x, h, lambda x: whole_faces(ctx, solid, x, h))
     assert np.array_equal(diagram.home, np.arange(len(x)))
     return solid, diagram.faces
 
@@ -142,7 +149,7 @@ def test_an_edge_across_a_crease_with_both_ends_outside_closes_a_face(ctx, seed)
     x = np.stack(np.meshgrid(k, k, k, indexing="ij"), axis=-1).reshape(-1, 3)
     x += np.random.default_rng(seed).uniform(-0.35, 0.35, x.shape) * H
     h = np.full(len(x), H)
-    faces = solid_diagram(WallSurface(solid), x, h, whole_faces(ctx, solid, x, h)).faces
+    faces = solid_diagram(WallSurface(solid), x, h, lambda x: whole_faces(ctx, solid, x, h)).faces
     walls = np.bincount(-1 - faces.neighbor[faces.n_inner :], faces.area[faces.n_inner :])
     assert np.abs(walls - 1).max() < 1e-12
     assert abs(faces.volumes.sum() - 1) < 1e-12
@@ -155,7 +162,7 @@ def test_a_cell_with_a_concave_crease_is_cut(ctx):
     x[np.linalg.norm(x - (1, 1, 0.5), axis=1) < H] += 0.25 * H * np.array([1, -0.6, 0.1])
     h = np.full(len(x), H)
     with pytest.warns(clvoro.errors.MismatchWarning, match="cells at .* are parts of others"):
-        d = solid_diagram(WallSurface(solid), x, h, whole_faces(ctx, solid, x, h))
+        d = solid_diagram(WallSurface(solid), x, h, lambda x: whole_faces(ctx, solid, x, h))
     assert d.check("openfoam")
     assert d.check()
     assert d.volumes.sum() == pytest.approx(solid.measure, rel=1e-9)
@@ -170,7 +177,7 @@ def test_a_crease_that_cannot_be_followed_is_left_out(ctx):
     x = np.delete(x, np.linalg.norm(x - (1 + H / 2, 1 - H / 2, 0.5), axis=1).argmin(), axis=0)
     h = np.full(len(x), H)
     with pytest.warns(clvoro.errors.MismatchWarning, match="leave out creases"):
-        d = solid_diagram(WallSurface(solid), x, h, whole_faces(ctx, solid, x, h))
+        d = solid_diagram(WallSurface(solid), x, h, lambda x: whole_faces(ctx, solid, x, h))
     assert d.check("openfoam")
     assert np.abs(d.left_out.measures).sum() < 0.5 * H**3
     assert d.volumes.sum() == pytest.approx(solid.measure, rel=0.01)
@@ -188,7 +195,7 @@ def test_a_plate_thinner_than_a_cell_keeps_its_cells(ctx):
     thin = []
     for points in (x, moved):
         with pytest.warns(clvoro.errors.MismatchWarning, match="as thin as the solid"):
-            d = solid_diagram(WallSurface(solid), points, h, whole_faces(ctx, solid, points, h))
+            d = solid_diagram(WallSurface(solid), points, h, lambda x, h=h: whole_faces(ctx, solid, x, h))
         assert len(d) == len(x)
         assert d.volumes.sum() == pytest.approx(solid.measure, rel=1e-9)
         thin.append(np.count_nonzero(d.faces.measures.determinant < 1e-3))
@@ -251,7 +258,7 @@ def test_cures_are_repeated_where_cells_are_the_same(ctx):
     points[order] = mesh.points
     corners = np.concatenate([np.roll(order[mesh.corners[a:b]], 1) for a, b in itertools.pairwise(mesh.starts)])
     other = replace(mesh, points=points, corners=corners.astype(np.int32))
-    again = Cures(cures.surface, other, cures.home, cures.sizes, cures)
+    again = Cures(cures.surface, other, cures.names, cures.sizes, cures)
     assert len(again.edits.taken) == len(cures.edits.taken) > 0
     expected, found = cures.edits.result()[0], again.edits.result()[0]
     assert found.n_cells == expected.n_cells > mesh.n_cells
@@ -259,8 +266,20 @@ def test_cures_are_repeated_where_cells_are_the_same(ctx):
     first = cures.edits.taken[0]
     v = order[next(v for k in first.faces_of(cells[0]) for v in first.face(k)[2] if v < len(order))]
     points[v] += 1e-3 * H
-    again = Cures(cures.surface, replace(other, points=points.copy()), cures.home, cures.sizes, cures)
+    again = Cures(cures.surface, replace(other, points=points.copy()), cures.names, cures.sizes, cures)
     assert len(again.edits.taken) < len(cures.edits.taken)
+
+
+def test_generators_of_rejected_cells_are_moved_inside_of_the_solid():
+    """One of them in a corner is moved away from it; where there is no room, it stays."""
+    solid = clvoro.Solid.box((0, 0, 0), (1, 1, 0.25 * H))
+    x = np.array([[0.5, 0.5, 0.12 * H], [0.5, 0.2, 0.13 * H], [0.12 * H, 0.12 * H, 0.12 * H], [0.3, 0.3, 0.05 * H]])
+    for move in range(3):
+        moved = _moved(WallSurface(solid), x, np.full(4, H), np.array([0, 2, 3]), move)
+        away = np.linalg.norm(moved - x, axis=1) / H
+        assert away[1] == 0
+        assert all(a == 0 or a == pytest.approx(0.15) for a in away)
+        assert (solid.signed_distance(moved[away > 0]) < 0).all()
 
 
 def test_mergers_losses_and_collapses_change_what_they_name(ctx):

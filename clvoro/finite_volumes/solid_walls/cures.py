@@ -60,8 +60,8 @@ class Cures:
     ----------
     surface : WallSurface
     faces : Faces
-    home : (n,) int
-        Names of the cells.
+    names : (n,) int
+        Of the cells, for other meshes of them.
     sizes : (n,) float
         h of the cells.
     earlier : Cures, optional
@@ -76,9 +76,9 @@ class Cures:
     """
 
     def __init__(
-        self, surface: WallSurface, faces: Faces, home: np.ndarray, sizes: np.ndarray, earlier: Cures | None = None
+        self, surface: WallSurface, faces: Faces, names: np.ndarray, sizes: np.ndarray, earlier: Cures | None = None
     ) -> None:
-        self.surface, self.edits, self.home, self.sizes = surface, Edits(faces), home, sizes
+        self.surface, self.edits, self.names, self.sizes = surface, Edits(faces), names, sizes
         self.changes, self.searches, self.changed, self.tried = 0, 0, dict[int, int](), dict[int, int]()
         self.excess: dict[int, tuple[int, float]] = {}
         self.judged: dict[tuple[Edits, int, bool], list[Option]] = {}
@@ -88,7 +88,7 @@ class Cures:
     def _take_over(self, earlier: Cures) -> None:
         """Make the changes of earlier cures, and pass over cells where none helped, where the cells are the same."""
         old = earlier.edits
-        matches = Matches(old, earlier.home, self.edits, self.home)
+        matches = Matches(old, earlier.names, self.edits, self.names)
         cells = self.edits.repeat(old, matches)
         self.changes = earlier.changes
         self.changed = {cells[c]: when for c, when in earlier.changed.items() if c in cells}
@@ -441,20 +441,21 @@ def _helps(gain: Gain) -> bool:
 def cured(
     surface: WallSurface,
     faces: Faces,
-    home: np.ndarray,
+    names: np.ndarray,
     own: np.ndarray,
     sizes: np.ndarray,
     rejected: np.ndarray,
     earlier: Cures | None,
 ) -> tuple[Faces, np.ndarray, np.ndarray, np.ndarray, Cures | None]:
-    """Return the mesh with its `rejected` cells (k,) cured where that works, `home`, `own`, rejected cells, cures.
+    """Return the mesh with its `rejected` cells (k,) cured where that works; the cell that each was.
 
-    All as in `_Made`. The mesh comes back as it is if in the end more of its cells would be rejected than before.
-    `earlier` cures are those of an earlier mesh of the same cells, of which the walls may differ.
+    Then follow `own` and rejected cells, as in `_Made`, and the cures. The mesh comes back as it is if in the end more
+    of its cells would be rejected than before. `earlier` cures are those of another mesh
+    of these cells, with other walls.
     """
     if len(rejected) > _TOO_MANY * faces.n_cells:
-        return faces, home, own, rejected, None
-    cures = Cures(surface, faces, home, sizes, earlier)
+        return faces, np.arange(faces.n_cells), own, rejected, None
+    cures = Cures(surface, faces, names, sizes, earlier)
     todo, again = rejected.tolist(), True
     while again:
         again = False
@@ -469,7 +470,7 @@ def cured(
     changed = np.isin(cells, [*rejected.tolist(), *cures.edits.touched])
     left = rejected_at_walls(made, with_neighbors(made, changed))
     if len(left) > len(rejected):
-        return faces, home, own, rejected, None
+        return faces, np.arange(faces.n_cells), own, rejected, None
     origin = np.array([cures.edits.origins.get(c, c) for c in cells.tolist()])
     is_own = (cells < len(own)) & np.append(own, np.zeros(cures.edits.next_cell, bool))[cells]
-    return made, home[origin], is_own, left, cures
+    return made, origin, is_own, left, cures

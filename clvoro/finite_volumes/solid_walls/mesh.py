@@ -42,6 +42,10 @@ _FEW = 0.03
 """Largest share of generators without a cell; a solid with more of them is refused."""
 _PATIENCE, _ATTEMPTS = 3, 8
 """How often a mesh is made again without fewer rejected cells than before, and at all."""
+_MOVES, _MOVE = 3, 0.15
+"""How often generators of rejected cells are moved, and how far, over h."""
+_DEEP = 0.1
+"""Least depth of moved generators in the solid, over h."""
 _MISSED = 0.1
 """A crossing of a crease becomes a vertex of a chord on its face that is farther from it than this share of h."""
 
@@ -132,10 +136,12 @@ def solid_diagram(
     surface: WallSurface,
     points: np.ndarray,
     sizes: np.ndarray,
-    whole: Faces,
+    whole: Callable[[np.ndarray], Faces],
     tell: Callable[[str], object] = lambda _: None,
 ) -> Diagram:
     """Return the mesh of a solid as a diagram, without short edges at walls.
+
+    Where cells are still rejected in the end, their generators are moved a little, and the mesh is made again.
 
     Parameters
     ----------
@@ -144,8 +150,9 @@ def solid_diagram(
         Generators inside.
     sizes : (n,) float
         h at the generators.
-    whole : Faces
-        Of the diagram of the generators, and of `outer_generators` after them, in a box around the solid.
+    whole : callable
+        Returns the faces of the diagram of generators (n, 3), and of `outer_generators` after them, in a box around
+        the solid.
     tell : callable
         Called with the name of each part of the work.
 
@@ -159,44 +166,33 @@ def solid_diagram(
     MismatchWarning
         If generators have no cell, cells are cut, leave out creases, or are concave: how many, and the first place.
     """
-    near = NearWalls.of(surface, points, sizes, whole)
-    del whole
-    walls = np.full(len(near.sizes), EXACT, np.int8)
-    best, last, kept, since = None, None, walls, 0
-    for attempt in range(1, _ATTEMPTS + 1):
-        if since == _PATIENCE:
+    near = NearWalls.of(surface, points, sizes, whole(points))
+    best = _Attempts(surface, near, np.full(len(near.sizes), EXACT, np.int8), None, tell)
+    for move in range(_MOVES):
+        rows = np.setdiff1d(near.numbers[best.made.home[best.made.rejected]], [-1])
+        if not 0 < len(rows) <= _FEW * len(points):
             break
-        number = "" if attempt == 1 else f", attempt {attempt}"
+        moved = _moved(surface, near.points, sizes, rows, move)
+        other = NearWalls.of(surface, moved, sizes, whole(moved))
+        walls = np.full(len(points) + 1, EXACT, np.int8)
+        walls[near.numbers] = best.walls
+        walls[rows] = EXACT
         try:
-            tell(f"walls of {len(near.rows)} cells{number}")
-            raw = _Maker(surface, near, walls).mesh()
-            _check_lost(surface, near, raw.home)
-        except InputError:  # a simpler cell of a thin part may be nothing
-            if best is None:
-                raise
+            made = _Attempts(surface, other, walls[other.numbers], best.made.cures, tell, f", moved {move + 1}")
+        except InputError:
             break
-        last = _finished(
-            surface, near, raw, None if last is None else last.cures, lambda part, number=number: tell(part + number)
-        )
-        since += 1
-        places = last.faces.generators[last.rejected]
-        if best is None or len(last.rejected) < len(best.rejected):
-            best, kept, since = last, walls.copy(), 0
-        elif (surface.nearest_crease(places, 3 * near.sizes[last.home[last.rejected]])[0] < 0).all():
-            break  # without creases there the next attempts are the same
-        if not len(last.rejected):
-            break
-        _simplify(walls, near, np.unique(last.home[last.rejected]))
-    assert best is not None
-    rejected = best.faces.generators[best.rejected]
+        if len(made.made.rejected) < len(best.made.rejected):
+            best, near = made, other
+    made, points = best.made, near.points
+    rejected = made.faces.generators[made.rejected]
     tell("cells without walls")
-    faces, home = near.put_back(best.faces, best.home, best.own)
+    faces, home = near.put_back(made.faces, made.home, made.own)
     lost = np.setdiff1d(np.arange(len(points)), home)
     for rows, text in (
         (points[lost], "generators at {} have no cell: the solid is thinner than a cell, which is left out"),
         (points[-1 - home[home < 0]], "cells at {} are parts of others, cut where these were concave"),
         (
-            near.generators[kept >= FILLED],
+            near.generators[best.walls >= FILLED],
             "cells at {} leave out creases or corners, of which several meet within a cell",
         ),
         (rejected, "cells at {} are concave, inverted, or as thin as the solid, and OpenFOAM does not accept them"),
@@ -207,6 +203,81 @@ def solid_diagram(
     diagram = diagram_of(faces)
     diagram.home = home
     return diagram
+
+
+def _moved(surface: WallSurface, points: np.ndarray, sizes: np.ndarray, rows: np.ndarray, move: int) -> np.ndarray:
+    """Return generators of which some are moved, each time in other directions; they stay inside."""
+    points = points.copy()
+    away = np.random.default_rng(move).normal(size=(len(rows), 3))
+    away *= (_MOVE * sizes[rows] / np.linalg.norm(away, axis=1))[:, None]
+    for sign in (1, -1):
+        inside = surface.closest(points[rows] + sign * away)[2] < -_DEEP * sizes[rows]
+        points[rows[inside]] += sign * away[inside]
+        rows, away = rows[~inside], away[~inside]
+    return points
+
+
+class _Attempts:
+    """The mesh of the fewest rejected cells of several, with ever simpler walls where cells are rejected.
+
+    Parameters
+    ----------
+    surface : WallSurface
+    near : NearWalls
+    walls : (p + 1,) int8
+        How the walls of each cell are made at first.
+    cures : Cures or None
+        Of an earlier mesh.
+    tell : callable
+        Called with the name of each part of the work, and `label`.
+
+    Attributes
+    ----------
+    made : _Made
+        The mesh.
+    walls : (p + 1,) int8
+        How its walls are made.
+
+    Raises
+    ------
+    InputError
+        If generators have no cell, as the solid is too thin there.
+    """
+
+    def __init__(
+        self,
+        surface: WallSurface,
+        near: NearWalls,
+        walls: np.ndarray,
+        cures: Cures | None,
+        tell: Callable[[str], object],
+        label: str = "",
+    ) -> None:
+        walls, best, since = walls.copy(), None, 0
+        for attempt in range(1, _ATTEMPTS + 1):
+            if since == _PATIENCE:
+                break
+            number = label if attempt == 1 else f"{label}, attempt {attempt}"
+            try:
+                tell(f"walls of {len(near.rows)} cells{number}")
+                raw = _Maker(surface, near, walls).mesh()
+                _check_lost(surface, near, raw.home)
+            except InputError:  # a simpler cell of a thin part may be nothing
+                if best is None:
+                    raise
+                break
+            made = _finished(surface, near, raw, cures, lambda part, number=number: tell(part + number))
+            cures, since = made.cures, since + 1
+            places = made.faces.generators[made.rejected]
+            if best is None or len(made.rejected) < len(best.rejected):
+                best, self.walls, since = made, walls.copy(), 0
+            elif (surface.nearest_crease(places, 3 * near.sizes[made.home[made.rejected]])[0] < 0).all():
+                break  # without creases there the next attempts are the same
+            if not len(made.rejected):
+                break
+            _simplify(walls, near, np.unique(made.home[made.rejected]))
+        assert best is not None
+        self.made = best
 
 
 def _check_lost(surface: WallSurface, near: NearWalls, home: np.ndarray) -> None:
@@ -239,7 +310,9 @@ def _finished(
         rejected = rejected_at_walls(faces, with_neighbors(faces, changed | suspect))
     if len(rejected):
         tell("cells that are rejected at walls")
-        faces, home, own, rejected, cures = cured(surface, faces, home, own, near.sizes[home], rejected, earlier)
+        names, h = near.numbers[home], near.sizes[home]
+        faces, origin, own, rejected, cures = cured(surface, faces, names, own, h, rejected, earlier)
+        home = home[origin]
     if not own.all():
         centroids = faces.measures.geometry.centroids
         faces = replace(faces, generators=np.where(own[:, None], faces.generators, centroids))

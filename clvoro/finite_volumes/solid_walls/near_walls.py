@@ -82,6 +82,11 @@ class NearWalls:
     sizes: np.ndarray
     cells: CellFaces
 
+    @property
+    def numbers(self) -> np.ndarray:
+        """Return the generator of each cell, (p + 1,) int; -1 for the rest."""
+        return np.append(self.rows, -1)
+
     @classmethod
     def of(cls, surface: WallSurface, points: np.ndarray, sizes: np.ndarray, faces: Faces) -> NearWalls:
         """Take the cells near the surface out of the diagram `faces` of generators `points` (n, 3) and outer ones."""

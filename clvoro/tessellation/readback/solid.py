@@ -13,6 +13,7 @@ from ...geometry.box import Box
 from ...geometry.domain import Domain
 from ...geometry.solid.solid import Solid
 from ...mesh.diagram import Diagram
+from ...mesh.faces import Faces
 from ...opencl.engine import Engine
 from ..device_diagram import Tessellation
 from ..own_planes import SurfaceSearch
@@ -46,12 +47,13 @@ def make_mesh(engine: Engine, domain: Solid, points: np.ndarray, sizes: np.ndarr
     tell("diagram of all cells")
     surface = WallSurface(domain, SurfaceSearch(engine, domain, domain.wall_triangles).nearest)
     points = off_middle(surface, points, sizes)
-    outer = outer_generators(surface, points, sizes)
     reach = _MARGIN * sizes.max()
     box = Box(tuple(np.subtract(domain.lower, reach).tolist()), tuple(np.add(domain.upper, reach).tolist()))
-    stages = TessellationStages(engine.replaced(traits=box.traits(engine.real)))
-    whole = make_diagram(stages, box, np.concatenate([points, outer]))
-    stages.release()
-    faces = replace(whole.faces, diagram=None)
-    del whole
-    return solid_diagram(surface, points, sizes, faces, tell)
+
+    def whole(points: np.ndarray) -> Faces:
+        stages = TessellationStages(engine.replaced(traits=box.traits(engine.real)))
+        made = make_diagram(stages, box, np.concatenate([points, outer_generators(surface, points, sizes)]))
+        stages.release()
+        return replace(made.faces, diagram=None)
+
+    return solid_diagram(surface, points, sizes, whole, tell)
