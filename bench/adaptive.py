@@ -1,7 +1,8 @@
 """Meshes that follow a function: interpolation error against the isotropic optimum, beside Gmsh and MMG.
 
     python bench/adaptive.py [--spaces plane,space,sphere] [--functions smooth,layer,kink,shock] [--cells 4000]
-                             [--cycles 4] [--growth 1.4] [--effort fast] [--pictures FOLDER] [--device NAME] [--json]
+                             [--cycles 4] [--growth 1.4] [--effort fast] [--exact] [--norms 1,2] [--peers ""]
+                             [--pictures FOLDER] [--device NAME] [--json]
 
 Each mesh begins uniform. A cycle evaluates the function at the centroids of the cells, takes sizes from
 `hessian_size(u, on=mesh, n_cells=N, p)`, and adapts the generators to them. The first half of the cycles has a quarter
@@ -17,8 +18,12 @@ isotropic meshes: with e(x) the L^p mean of the error on a simplex of volume 1, 
 over all orientations of equilateral triangles, or of the tetrahedra of a body-centered lattice, whose number is that
 of the mesh. The columns "L1" and "L2" are the error over this optimum, each for a mesh of its own p; "uniform" is the
 error of the uniform mesh over it, and "predicted" the error that the last sizes predict over the true one. Targets:
-1.15 in the plane and on the sphere, 1.25 in space. The optimum is that of cells much smaller than the function's
-features. Where "predicted" is below 1 they are not: the cells see less curvature than there is.
+1.15 in the plane and on the sphere, 1.25 in space.
+
+Two more columns say where the rest comes from. "sizes" is the error over the optimum if all simplices were regular,
+with the volumes of the mesh's cells, at random places in them: what the sizes alone cost. L1 and L2 over "sizes" is
+the share of the shapes. With `--exact` the sizes come from the function's own second derivatives, averaged over a
+ball of the size of a cell: the difference is what the estimate costs.
 """
 
 from __future__ import annotations
@@ -39,12 +44,18 @@ from scipy.stats import qmc
 
 import clvoro
 from clvoro import sizing
+from clvoro.sizing.estimates import estimate
 from clvoro.sizing.graded import default_engine
 
 Function = Callable[[np.ndarray], np.ndarray]
 TARGET = {2: 1.15, 3: 1.25}
 BATCH = 4_000_000
 SAMPLES = 1 << 16
+ROUNDS = 24
+PER_CELL = {2: 2, 3: 6}
+"""Simplices for each point of a hexagonal or a body-centered lattice."""
+BALL = {2: math.pi**-0.5, 3: (0.75 / math.pi) ** (1 / 3)}
+"""Radius of the ball of measure 1."""
 
 
 FUNCTIONS: dict[str, Callable[[np.ndarray, np.ndarray], np.ndarray]] = {
@@ -103,16 +114,45 @@ class Space:
         """Return points on the domain: on the sphere those of its flat triangles are moved outwards."""
         return x / np.linalg.norm(x, axis=-1, keepdims=True) if self.is_sphere else x
 
-    def samples(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return points that fill the domain evenly, (n, D), and the directions along it at each, (n, d, D)."""
+    def directions(self, x: np.ndarray) -> np.ndarray:
+        """Return unit vectors along the domain at points (n, D), (n, d, D)."""
+        if not self.is_sphere:
+            return np.broadcast_to(np.eye(self.dim), (len(x), self.dim, self.dim))
+        angle = np.arctan2(x[:, 1], x[:, 0])
+        east = np.column_stack([-np.sin(angle), np.cos(angle), 0 * angle])
+        return np.stack([east, np.cross(x, east)], axis=1)
+
+    def samples(self) -> np.ndarray:
+        """Return points that fill the domain evenly, (n, D)."""
         t = qmc.Sobol(self.dim, seed=1).random(SAMPLES)
         if not self.is_sphere:
-            return t, np.broadcast_to(np.eye(self.dim), (len(t), self.dim, self.dim))
+            return t
         z, angle = 2 * t[:, 0] - 1, 2 * np.pi * t[:, 1]
         s = np.sqrt(1 - z**2)
-        x = np.column_stack([s * np.cos(angle), s * np.sin(angle), z])
-        east = np.column_stack([-np.sin(angle), np.cos(angle), 0 * z])
-        return x, np.stack([east, np.cross(x, east)], axis=1)
+        return np.column_stack([s * np.cos(angle), s * np.sin(angle), z])
+
+    def bends(self, u: Function, x: np.ndarray) -> np.ndarray:
+        """Return the eigenvalues of the Hessian of a function at points, (n, d)."""
+        d, step, along = self.dim, 1e-4, self.directions(x)
+        hessian = np.empty((len(x), d, d))
+        for a in range(d):
+            for b in range(a + 1):
+                total = np.zeros(len(x))
+                for i, j in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
+                    v = step * (i * along[:, a] + j * along[:, b])
+                    if a == b:
+                        v = 2 * step * i * along[:, a] if i == j else 0 * v
+                    length = np.linalg.norm(v, axis=1, keepdims=True)
+                    there = x * np.cos(length) + v * np.sinc(length / np.pi) if self.is_sphere else x + v
+                    total += i * j * u(there)
+                hessian[:, a, b] = hessian[:, b, a] = total / (4 * step**2)
+        return np.linalg.eigvalsh(hessian)
+
+    def around(self, mesh: clvoro.Diagram, rng: np.random.Generator, reach: float) -> np.ndarray:
+        """Return a random vector (n, d) for each cell, in a ball of radius `reach` times the size of the cell."""
+        away = rng.normal(size=(len(mesh), self.dim))
+        away *= (rng.random(len(mesh)) ** (1 / self.dim) / np.linalg.norm(away, axis=1))[:, None]
+        return reach * mesh.volumes[:, None] ** (1 / self.dim) * away
 
 
 SPACES = {
@@ -169,21 +209,8 @@ def reference_simplices(dim: int) -> np.ndarray:
 @cache
 def optimum(space: Space, u: Function, p: int) -> float:
     """Return the least L^p error of isotropic meshes, times the number of their simplices to the power 2 / d."""
-    d, step = space.dim, 1e-4
-    x, along = space.samples()
-    hessian = np.empty((len(x), d, d))
-    for a in range(d):
-        for b in range(a + 1):
-            total = np.zeros(len(x))
-            for i, j in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
-                v = step * (i * along[:, a] + j * along[:, b])
-                if a == b:
-                    v = 2 * step * i * along[:, a] if i == j else 0 * v
-                length = np.linalg.norm(v, axis=1, keepdims=True)
-                there = x * np.cos(length) + v * np.sinc(length / np.pi) if space.is_sphere else x + v
-                total += i * j * u(there)
-            hessian[:, a, b] = hessian[:, b, a] = total / (4 * step**2)
-    eigen = np.linalg.eigvalsh(hessian)
+    d, x = space.dim, space.samples()
+    eigen = space.bends(u, x)
     corners, weights = reference_simplices(d), inner_points(d, 32)
     inside = np.einsum("qb,nbd->nqd", weights, corners)
     # The error of x^2 / 2 along each axis; that of a quadratic function is their sum, with the eigenvalues.
@@ -198,19 +225,49 @@ def optimum(space: Space, u: Function, p: int) -> float:
     return mean ** (1 / power)
 
 
+def ideal_error(space: Space, mesh: clvoro.Diagram, u: Function, p: int) -> float:
+    """Return the L^p error of regular simplices with the volumes of the cells, at random places in them."""
+    d, rng = space.dim, np.random.default_rng(4)
+    corners, weights = reference_simplices(d), inner_points(d, 32)
+    corners = (corners - corners.mean(axis=1, keepdims=True)) * PER_CELL[d] ** (-1 / d)
+    along, length = space.directions(mesh.centroids), mesh.volumes[:, None, None] ** (1 / d)
+    total = np.zeros(len(mesh))
+    for _ in range(ROUNDS):
+        at = length * corners[rng.integers(len(corners), size=len(mesh))]
+        at = at + space.around(mesh, rng, BALL[d])[:, None]
+        at = space.onto(mesh.centroids[:, None] + np.einsum("nkd,ndD->nkD", at, along))
+        inside = space.onto(np.einsum("qk,nkD->nqD", weights, at))
+        total += (np.abs(u(at) @ weights.T - u(inside)) ** p).mean(axis=1)
+    return float(mesh.volumes @ total / ROUNDS) ** (1 / p)
+
+
+def exact_size(space: Space, u: Function, mesh: clvoro.Diagram, p: int, n: int, growth: float) -> sizing.Estimate:
+    """Return `hessian_size` with the function's own second derivatives, averaged around each cell."""
+    rng, along = np.random.default_rng(5), space.directions(mesh.centroids)
+    bent = np.zeros(len(mesh))
+    for _ in range(ROUNDS):
+        away = np.einsum("nd,ndD->nD", space.around(mesh, rng, 1.0), along)
+        bent += np.abs(space.bends(u, space.onto(mesh.centroids + away))).max(axis=1) / ROUNDS
+    bounds = {"n_cells": n, "eps": None, "h_min": 0.0, "h_max": math.inf}
+    return estimate("exact_size", mesh, bent, order=2, p=p, constant=1 / 8, growth=growth, **bounds)
+
+
 def adapt(
     space: Space, adapter: clvoro.Adapter, u: Function, n: int, options: Any, p: int
 ) -> tuple[clvoro.Result, sizing.Estimate, clvoro.Result]:
     """Return the mesh that follows a function, its sizes, and the uniform mesh."""
-    size = (space.domain.measure / n) ** (1 / space.dim)
-    uniform = adapter.run(space.domain, size, options.effort, n_cells=n, seed=FIRST_SEED)
+    even = (space.domain.measure / n) ** (1 / space.dim)
+    uniform = adapter.run(space.domain, even, options.effort, n_cells=n, seed=FIRST_SEED)
     coarse = (space.domain.measure / (n // 4)) ** (1 / space.dim)
     mesh = adapter.run(space.domain, coarse, options.effort, n_cells=n // 4, seed=FIRST_SEED)
     for cycle in range(options.cycles):
         count = n // 4 if 2 * (cycle + 1) <= options.cycles else n
-        estimate = sizing.hessian_size(u(mesh.centroids), on=mesh, n_cells=count, p=p, growth=options.growth)
-        mesh = adapter.run(space.domain, estimate, options.effort, n_cells=count, points=mesh.points, seed=FIRST_SEED)
-    return mesh, estimate, uniform
+        if options.exact:
+            size = exact_size(space, u, mesh.diagram, p, count, options.growth)
+        else:
+            size = sizing.hessian_size(u(mesh.centroids), on=mesh, n_cells=count, p=p, growth=options.growth)
+        mesh = adapter.run(space.domain, size, options.effort, n_cells=count, points=mesh.points, seed=FIRST_SEED)
+    return mesh, size, uniform
 
 
 def picture(found: list[tuple[str, clvoro.Result]], path: Path) -> None:
@@ -236,6 +293,8 @@ COLUMNS = {
     "uniform": shown("uniform1", ".2f"),
     "L2": shown("L2", ".3f"),
     "uniform ": shown("uniform2", ".2f"),
+    "sizes": shown("sizes1", ".3f"),
+    "sizes ": shown("sizes2", ".3f"),
     "predicted": shown("predicted1", ".2f"),
     "predicted ": shown("predicted2", ".2f"),
     "seconds": shown("seconds", ".1f"),
@@ -250,6 +309,9 @@ def main(arguments: list[str] | None = None) -> int:
     made.add_argument("--cycles", type=int, default=4)
     made.add_argument("--growth", type=float, default=1.4)
     made.add_argument("--effort", default="fast", choices=("fast", "default", "best"))
+    made.add_argument("--exact", action="store_true")
+    made.add_argument("--norms", default="1,2")
+    made.add_argument("--peers", default=",".join(MESHERS))
     made.add_argument("--pictures", type=Path, metavar="FOLDER")
     options = made.parse_args(arguments)
     adapter, report, missed = make_adapter(options), Report(options.json, COLUMNS), False
@@ -259,17 +321,17 @@ def main(arguments: list[str] | None = None) -> int:
         for function in names(options.functions):
             u = space.function(function)
             rows: dict[str, dict[str, Any]] = {}
-            for p in (1, 2):
+            for p in map(int, names(options.norms)):
                 start = time.perf_counter()
-                mesh, estimate, uniform = adapt(space, adapter, u, options.cells, options, p)
+                mesh, followed, uniform = adapt(space, adapter, u, options.cells, options, p)
                 seconds = time.perf_counter() - start
                 points = {"clvoro": space.unknowns(mesh.diagram)}
                 if not space.is_sphere:
                     # On the device, because Gmsh takes millions of values.
-                    sizes = sizing.Sizing(default_engine(space.dim), space.domain, estimate)
-                    for peer, mesher in MESHERS.items():
+                    sizes = sizing.Sizing(default_engine(space.dim), space.domain, followed)
+                    for peer in names(options.peers):
                         try:
-                            points[peer] = remesh(mesher, space.domain, sizes, len(points["clvoro"]))[0]
+                            points[peer] = remesh(MESHERS[peer], space.domain, sizes, len(points["clvoro"]))[0]
                         except MissingPeerError as error:
                             print(f"left out: {error}")
                 for mesher, x in points.items():
@@ -280,7 +342,9 @@ def main(arguments: list[str] | None = None) -> int:
                     if mesher == "clvoro":
                         plain, count = interpolation_errors(space, space.unknowns(uniform.diagram), u)
                         over = plain[p] / (optimum(space, u, p) * count ** (-2 / space.dim))
-                        row |= {f"uniform{p}": over, f"predicted{p}": estimate.norm / errors[p], "seconds": seconds}
+                        row |= {f"uniform{p}": over, f"predicted{p}": followed.norm / errors[p], "seconds": seconds}
+                        even = optimum(space, u, p) * (PER_CELL[space.dim] * len(mesh)) ** (-2 / space.dim)
+                        row[f"sizes{p}"] = ideal_error(space, mesh.diagram, u, p) / even
                         missed |= errors[p] / least > TARGET[space.dim]
             if name == "plane":
                 drawn.append((function, mesh))

@@ -1,15 +1,18 @@
 """A front that moves with the flow, on a mesh that follows it: error, conservation, extrema, and the number of cells.
 
-    python bench/following.py [--cells 1000,2000] [--cycles 50] [--uniform 1000,4000,16000] [--width 0.02]
+    python bench/following.py [--cells 1000,2000] [--cycles 50] [--uniform 1000,4000,16000] [--steps 8] [--width 0.02]
                               [--picture FILE] [--device NAME] [--json]
 
 A disk with a smooth rim of the given width turns once around the middle of a square, in `--cycles` parts. After each
-the sizes are those of `hessian_size` of the present solution and of the solution at the end of the next part, as if it
-only turned (`combine`); a run follows them (`Run.follow`), and the solution is transferred by `Diagram.transfer`. The
-solver is of second order: linear functions in the cells, limited by Barth and Jespersen, upwind fluxes, and Heun's
-method. "L1" is the error over the integral of the disk. "mass" is the largest relative change of the integral in a
-transfer, "extrema" the largest excess over the values before one. "drift" is the largest deviation of the number of
-cells from that of the first mesh, without `n_cells`. "solver", "mesh" and "transfer" are shares of the seconds.
+the sizes are those of `hessian_size` of the present solution and of the solution at the end of the next part, as if
+it only turned (`combine`); a run follows them (`Run.follow`) by at most `--steps` steps, and the solution is
+transferred by `Diagram.transfer`. The solver is of second order: linear functions in the cells, limited by Barth and
+Jespersen, upwind fluxes, and Heun's method. "L1" is the error over the integral of the disk. "mass" is the largest
+relative change of the integral in a transfer, "extrema" the largest excess over the values before one. "drift" is the
+largest deviation of the number of cells from that of the first mesh, without `n_cells`, "|e|" the largest mean error
+of the sizes, "Q" the least mean quality. "s" are seconds of the loop by the clock, from the first solution on, "cpu
+s" those of processor time, of these "solver", "mesh" and "transfer". Compare times within one call, and after a first
+call that has built the kernels.
 """
 
 from __future__ import annotations
@@ -110,7 +113,26 @@ def sizes(u: np.ndarray, mesh: clvoro.Diagram, n: float, turn: float) -> sizing.
     return sizing.normalize(sizing.combine(*parts), n_cells=n, growth=1.25, h_max=0.2)
 
 
-def followed(adapter: clvoro.Adapter, n: int, cycles: int, width: float) -> tuple[dict[str, Any], Any]:
+class Clock:
+    """Seconds by the clock and of processor time, in all and in each part of a loop."""
+
+    def __init__(self) -> None:
+        self.parts: dict[str, float] = {}
+        self._start = self._last = time.perf_counter(), time.process_time()
+
+    def spent(self, name: str) -> None:
+        """Count the time since the last call for a part."""
+        now = time.perf_counter(), time.process_time()
+        self.parts[name] = self.parts.get(name, 0.0) + now[1] - self._last[1]
+        self._last = now
+
+    def record(self) -> dict[str, float]:
+        """Return the seconds of all parts."""
+        wall, cpu = (last - start for last, start in zip(self._last, self._start, strict=True))
+        return {**self.parts, "seconds": wall, "cpu_seconds": cpu}
+
+
+def followed(adapter: clvoro.Adapter, n: int, cycles: int, steps: int, width: float) -> tuple[dict[str, Any], Any]:
     """Return the record of a mesh that follows, and the last mesh with its data."""
     turn = 2 * math.pi / cycles
     run = adapter.start(BOX, 2 / math.sqrt(n), "fast", seed=FIRST_SEED)
@@ -120,37 +142,38 @@ def followed(adapter: clvoro.Adapter, n: int, cycles: int, width: float) -> tupl
         mesh = run.finish().diagram
     u = means(mesh, 0, width)
     first, drift, mass, excess = len(mesh), 0.0, 0.0, 0.0
-    seconds = {"solver_seconds": 0.0, "mesh_seconds": 0.0, "transfer_seconds": 0.0}
-    steps = []
+    taken, errors, qualities = [], [], []
+    run = adapter.start(BOX, sizes(u, mesh, n, turn), "fast", points=mesh.points, seed=FIRST_SEED, max_steps=steps)
+    clock = Clock()
     for cycle in range(cycles):
-        start = time.perf_counter()
         u = Advection(mesh).advance(u, turn)
-        seconds["solver_seconds"] += time.perf_counter() - start
+        clock.spent("solver")
         if cycle + 1 == cycles:
             break
-        start = time.perf_counter()
         run.follow(sizes(u, mesh, n, turn))
         after = run.finish()
-        steps.append(int(after.history["step"][-1]))
-        seconds["mesh_seconds"] += time.perf_counter() - start
-        start = time.perf_counter()
+        clock.spent("mesh")
         v = mesh.transfer(u, onto=after, order=2, adapter=adapter)
-        seconds["transfer_seconds"] += time.perf_counter() - start
-        total = float(mesh.volumes @ u)
-        mass = max(mass, abs(float(after.diagram.volumes @ v) / total - 1))
+        clock.spent("transfer")
+        taken.append(int(after.history["step"][-1]))
+        errors.append(float(np.abs(after.size_error).mean()))
+        qualities.append(float(after.quality.mean()))
+        mass = max(mass, abs(float(after.diagram.volumes @ v) / float(mesh.volumes @ u) - 1))
         excess = max(excess, v.max() - u.max(), u.min() - v.min())
         mesh, u = after.diagram, v
         drift = max(drift, abs(len(mesh) / first - 1))
-    record = {"mesh": "followed", "cells": len(mesh), **_error(mesh, u, width), "mass": mass, "extrema": excess}
-    return {**record, "drift": drift, **seconds, "steps": float(np.median(steps))}, (mesh, u)
+    record = {"kind": "followed", "cells": len(mesh), **_error(mesh, u, width), "mass": mass, "extrema": excess}
+    record |= {"drift": drift, "steps": float(np.median(taken)), "e": max(errors), "quality": min(qualities)}
+    return record | clock.record(), (mesh, u)
 
 
 def uniform(adapter: clvoro.Adapter, n: int, width: float) -> dict[str, Any]:
     """Return the record of a uniform mesh."""
     mesh = adapter.run(BOX, 2 / math.sqrt(n), "fast", n_cells=n, seed=FIRST_SEED).diagram
-    start = time.perf_counter()
+    clock = Clock()
     u = Advection(mesh).advance(means(mesh, 0, width), 2 * math.pi)
-    return {"mesh": "uniform", "cells": n, **_error(mesh, u, width), "solver_seconds": time.perf_counter() - start}
+    clock.spent("solver")
+    return {"kind": "uniform", "cells": n, **_error(mesh, u, width), **clock.record()}
 
 
 def _error(mesh: clvoro.Diagram, u: np.ndarray, width: float) -> dict[str, float]:
@@ -159,16 +182,20 @@ def _error(mesh: clvoro.Diagram, u: np.ndarray, width: float) -> dict[str, float
 
 
 COLUMNS = {
-    "mesh": lambda r: r["mesh"],
+    "mesh": lambda r: r["kind"],
     "cells": shown("cells", ",d"),
     "L1": shown("l1", ".4f"),
     "mass": shown("mass", ".0e"),
     "extrema": shown("extrema", ".0e"),
     "drift": shown("drift", ".2%"),
     "steps": shown("steps", ".0f"),
-    "solver s": shown("solver_seconds", ".1f"),
-    "mesh s": shown("mesh_seconds", ".1f"),
-    "transfer s": shown("transfer_seconds", ".1f"),
+    "|e|": shown("e", ".3f"),
+    "Q": shown("quality", ".3f"),
+    "s": shown("seconds", ".1f"),
+    "cpu s": shown("cpu_seconds", ".1f"),
+    "solver": shown("solver", ".1f"),
+    "mesh ": shown("mesh", ".1f"),
+    "transfer": shown("transfer", ".1f"),
 }
 
 
@@ -177,12 +204,13 @@ def main(arguments: list[str] | None = None) -> int:
     made.add_argument("--cells", type=counts, default=counts("1000,2000"))
     made.add_argument("--cycles", type=int, default=50)
     made.add_argument("--uniform", type=counts, default=counts("1000,4000,16000"))
+    made.add_argument("--steps", type=int, default=8)
     made.add_argument("--width", type=float, default=0.02)
     made.add_argument("--picture", type=Path, metavar="FILE")
     options = made.parse_args(arguments)
     adapter, report = make_adapter(options), Report(options.json, COLUMNS)
     for n in options.cells:
-        record, (mesh, u) = followed(adapter, n, options.cycles, options.width)
+        record, (mesh, u) = followed(adapter, n, options.cycles, options.steps, options.width)
         report.add(record, f"followed, {n}")
         if options.picture:
             mesh.plot(u, label="u").savefig(options.picture, dpi=150)
