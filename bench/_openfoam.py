@@ -109,8 +109,9 @@ def write_prisms(
     patch_of: Callable[[np.ndarray], np.ndarray],
     patches: Mapping[str, str],
     thickness: float,
+    wedge: bool = False,
 ) -> None:
-    """Write a plane mesh as a polyMesh of one layer of prisms.
+    """Write a plane mesh as a polyMesh of one layer of prisms, or of a wedge about the axis y = 0.
 
     Parameters
     ----------
@@ -123,6 +124,8 @@ def write_prisms(
     patches : mapping
         Names and types of the patches.
     thickness : float
+        That of a wedge is at y = 1.
+    wedge : bool
     """
     sides: dict[tuple[int, int], list[tuple[int, int, int]]] = {}
     for number, cell in enumerate(cells):
@@ -140,14 +143,16 @@ def write_prisms(
     rows += [f"{len(c)}({' '.join(map(str, (c + v).tolist()))})" for c in cells]
     counts = [*np.bincount(patch, minlength=len(patches)).tolist(), len(cells), len(cells)]
     described, start = "", len(inner)
-    kinds = {**patches, "back": "empty", "front": "empty"}
+    kinds = {**patches, **dict.fromkeys(("back", "front"), "wedge" if wedge else "empty")}
+    height = thickness * (points[:, 1] if wedge else np.ones(v))
+    levels = [np.column_stack([points, height * share]) for share in ((-0.5, 0.5) if wedge else (0.0, 1.0))]
     for (name, kind), count in zip(kinds.items(), counts, strict=True):
         described += text_of({name: {"type": kind, "nFaces": count, "startFace": start}})
         start += count
     folder = case / "constant" / "polyMesh"
     folder.mkdir(parents=True, exist_ok=True)
     for name, kind, lines in (
-        ("points", "vectorField", [f"({x!r} {y!r} {z!r})" for z in (0.0, thickness) for x, y in points.tolist()]),
+        ("points", "vectorField", [f"({x!r} {y!r} {z!r})" for x, y, z in np.concatenate(levels).tolist()]),
         ("faces", "faceList", rows),
         ("owner", "labelList", list(map(str, owner))),
         ("neighbour", "labelList", [str(row[1]) for row in inner]),

@@ -1,7 +1,7 @@
 """Drag of bodies with OpenFOAM against cells: on uniform meshes, graded by hand, and adapted to the solution.
 
     python bench/bodies.py [--flow airfoil|sphere] [--uniform LIST] [--graded LIST] [--adapted LIST] [--first N]
-                           [--cycles 4] [--samples 1] [--pictures FOLDER] [--device NAME] [--json]
+                           [--cycles 4] [--samples 1] [--reference LIST] [--pictures FOLDER] [--device NAME] [--json]
 
 airfoil: a NACA 0012 section without incidence at Re 1000, in a square of 20 chords. sphere: Re 100, in a box of
 16 x 12 x 12 diameters. The sides of the box slip. The flow is laminar and steady (`simpleFoam`).
@@ -9,10 +9,14 @@ airfoil: a NACA 0012 section without incidence at Re 1000, in a square of 20 cho
 "Graded" has sizes that grow from the body, by a share of the distance; the size at the body follows from the number of
 cells. "Adapted" begins with a uniform mesh of --first cells, in which the body is as small as a cell or smaller;
 `clvoro.foam.adapt_case` makes --cycles meshes for the forces on the body (`FieldSizes(forces="body")`). No place is
-named, no size is given. Errors are those of the coefficient of drag in percent of a reference: for the airfoil that of
-fine meshes in the same box, known to 0.5 %, for the sphere one without a box (Johnson and Patel 1999, from memory).
-With --samples several meshes are made for each row, with counts that differ by one percent and with other seeds: shown
-are the median and the range.
+named, no size is given. Errors are those of the coefficient of drag in percent of a reference. With --samples several
+meshes are made for each row, with counts that differ by one percent and with other seeds: shown are the median and the
+range.
+
+--reference, such as 3000,12000,48000, finds the reference: on structured meshes of quadrilaterals between the body and
+the box, whose angles and ratios of radii are uniform; around the airfoil in the plane in which its chord is a circle.
+Their drag is extrapolated to cells of no size by Richardson's method. The flow around the sphere is that of a wedge, in
+a round box with the cross-section of the square one.
 """
 
 from __future__ import annotations
@@ -28,7 +32,7 @@ from typing import Any
 
 import numpy as np
 from _common import FIRST_SEED, Report, counts, heading, make_adapter, parser, spread
-from _openfoam import Case, forces_on, require
+from _openfoam import Case, forces_on, require, write_prisms
 
 import clvoro
 from clvoro import foam, sizing
@@ -37,6 +41,8 @@ from clvoro.geometry.domain import Domain
 
 STEPS = 1500
 """Most iterations on one mesh."""
+WEDGE = 0.1
+"""Thickness of a wedge at the distance 1 from its axis."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +60,9 @@ class Flow:
     slope : float
         Growth of the sizes that are graded by hand, per distance from the body.
     drag : float
-        The reference.
+        The reference, by --reference.
+    lines : callable
+        Returns the body and the box as complex lines, and the map between the plane of the flow and theirs.
     cells : dict of str to str
         Numbers of cells by kind of mesh.
     window : tuple
@@ -67,6 +75,7 @@ class Flow:
     thickness: float | None
     slope: float
     drag: float
+    lines: Callable[[], tuple[np.ndarray, np.ndarray, Callable[[np.ndarray], np.ndarray]]]
     cells: dict[str, str]
     window: tuple[tuple[float, float], tuple[float, float]]
 
@@ -85,6 +94,40 @@ def around_sphere() -> clvoro.Solid:
     return clvoro.Solid.outside(ball, clvoro.Box((-6, -6, -6), (10, 6, 6), names=sides))
 
 
+def lines_of_airfoil() -> tuple[np.ndarray, np.ndarray, Callable[[np.ndarray], np.ndarray]]:
+    """Return section and square where Joukowski's map makes a circle of its chord, and the map back.
+
+    The chord begins at the focus of the nose. At the sharp tail, where stresses have a singularity, sizes of cells are
+    proportional to the square of the angle.
+    """
+    nose = 1.1019 * 0.12**2 / 2
+
+    def to_circle(z: np.ndarray) -> np.ndarray:
+        w = 4 * (z - nose) / (1 - nose) - 2
+        return (w + np.sqrt(w - 2) * np.sqrt(w + 2)) / 2
+
+    x, y = clvoro.curves.naca("0012", tolerance=1e-8).vertices.T
+    corners = np.array([10.5 - 10j, 10.5 + 10j, -9.5 + 10j, -9.5 - 10j])
+    return (
+        to_circle(x + 1j * y),
+        to_circle(along(np.append(corners, corners[0]))),
+        lambda z: nose + (z + 1 / z + 2) * (1 - nose) / 4,
+    )
+
+
+def lines_of_sphere() -> tuple[np.ndarray, np.ndarray, Callable[[np.ndarray], np.ndarray]]:
+    """Return half of a circle, and of a section through a round box as long and as large across as the square one."""
+    wide = 12 / math.sqrt(math.pi)
+    corners = np.array([10, 10 + 1j * wide, -6 + 1j * wide, -6])
+    return 0.5 * np.exp(1j * np.linspace(0, math.pi, 1001)), along(corners), lambda z: z
+
+
+def along(corners: np.ndarray) -> np.ndarray:
+    """Return points on the straight lines between corners, these included."""
+    k = np.linspace(0, len(corners) - 1, 2000 * (len(corners) - 1) + 1)
+    return np.interp(k, np.arange(len(corners)), corners)
+
+
 FLOWS = {
     "airfoil": Flow(
         around_airfoil,
@@ -92,7 +135,8 @@ FLOWS = {
         0.1,
         0.1,
         0.15,
-        0.1217,
+        0.1199,
+        lines_of_airfoil,
         {"uniform": "10000,40000", "graded": "1000,2000,4000,8000,16000", "adapted": "1000,2000,4000"},
         ((-0.3, -0.4), (1.7, 0.4)),
     ),
@@ -102,7 +146,8 @@ FLOWS = {
         math.pi / 4,
         None,
         0.2,
-        1.09,
+        1.0963,
+        lines_of_sphere,
         {"uniform": "20000", "graded": "8000,20000", "adapted": "8000,20000"},
         ((-1.5, -1.5), (3.5, 1.5)),
     ),
@@ -123,9 +168,51 @@ def graded(flow: Flow, domain: Domain, n: int) -> sizing.Field:
     return sizing.Distance(domain.boundary("body"), h_min=low, slope=flow.slope)
 
 
-def write_case(case: Case, flow: Flow) -> None:
+def mesh_structured(case: Case, flow: Flow, n: int) -> None:
+    """Write a mesh of about `n` quadrilaterals between the body and the box, in the plane or as a wedge."""
+    body, box, back = flow.lines()
+    whole = flow.thickness is not None
+    turn = 2 * math.pi if whole else math.pi
+    ratio = float(np.log(np.abs(box)).mean() - np.log(np.abs(body)).mean()) / turn
+    many = round(math.sqrt(n / ratio))
+    angle = turn * np.arange(many + (not whole)) / many
+    if not whole:
+        # The axis is a narrow tube.
+        angle[[0, -1]] += 1e-3 * turn / many * np.array([1, -1])
+    inner, outer = (
+        np.interp(angle, np.angle(line) % (2 * math.pi), np.log(np.abs(line)), period=2 * math.pi) + 1j * angle
+        for line in (body, box)
+    )
+    corners = box[2000:-1:2000] if not whole else box[:-1:2000]
+    for corner in corners:
+        at = np.angle(corner) % (2 * math.pi)
+        outer[np.abs(angle - at).argmin()] = math.log(abs(corner)) + 1j * at
+    share = np.linspace(0, 1, round(ratio * many) + 1)[:, None]
+    share = (share + share**2) / 2
+    points = back(np.exp((1 - share) * inner + share * outer)).ravel()
+    row, k = np.meshgrid(np.arange(len(share) - 1), np.arange(many), indexing="ij")
+    a, b = (row * len(angle) + (k + step) % len(angle) for step in (0, 1))
+    cells = np.stack([a, a + len(angle), b + len(angle), b], axis=-1).reshape(-1, 4)
+    flat = np.column_stack([points.real, points.imag])
+    front, end, side = back(box).real.min() + 1e-3, back(box).real.max() - 1e-3, back(box).imag.max() - 1e-3
+
+    def patch_of(middles: np.ndarray) -> np.ndarray:
+        u, v = middles.T
+        is_axis = (v < 0.05 * turn / many) & (not whole)
+        return np.select([u < front, u > end, np.abs(v) > side, is_axis], [0, 1, 2, 4], 3)
+
+    kinds = {**dict.fromkeys(("inlet", "outlet", "sides"), "patch"), "body": "wall"} | (
+        {} if whole else {"axis": "patch"}
+    )
+    write_prisms(case.folder, flat, list(cells), patch_of, kinds, flow.thickness or WEDGE, wedge=not whole)
+
+
+def write_case(case: Case, flow: Flow, wedge: bool = False) -> None:
     """Write fields and dictionaries."""
-    flat = {} if flow.thickness is None else {name: {"type": "empty"} for name in ("back", "front")}
+    sides = "wedge" if wedge else "empty"
+    flat = {} if flow.thickness is None and not wedge else {name: {"type": sides} for name in ("back", "front")}
+    if wedge:
+        flat["axis"] = {"type": "slip"}
     closed, slip = {"type": "zeroGradient"}, {"type": "slip"}
     stream, zero = ({"type": "fixedValue", "value": f"uniform {value}"} for value in ("(1 0 0)", "0"))
     case.write_start(
@@ -137,10 +224,12 @@ def write_case(case: Case, flow: Flow) -> None:
         "p": {"solver": "GAMG", "smoother": "GaussSeidel", "tolerance": 1e-10, "relTol": 0.05},
         "U": {"solver": "PBiCGStab", "preconditioner": "DILU", "tolerance": 1e-11, "relTol": 0.05},
     }
-    functions = {"forces": forces_on("body", 1.0, 1.0, flow.area)}
+    # Across a wedge the velocity is round-off.
+    limits = {"p": 1e-7} if wedge else {"p": 1e-5, "U": 1e-6}
+    functions = {"forces": forces_on("body", 1.0, 1.0, WEDGE / 8 if wedge else flow.area)}
     case.write_system(
         flow.viscosity,
-        solution={"solvers": solvers, "SIMPLE": {"consistent": "yes", "residualControl": {"p": 1e-5, "U": 1e-6}}},
+        solution={"solvers": solvers, "SIMPLE": {"consistent": "yes", "residualControl": limits}},
         control={"endTime": STEPS, "writePrecision": 10, "functions": functions},
     )
 
@@ -149,6 +238,11 @@ def solve(
     case: Case, flow: Flow, adapter: clvoro.Adapter, kind: str, n: int, first: int, cycles: int, seed: int
 ) -> float:
     """Solve on a mesh of `n` cells, or adapt one to the solution; return the coefficient of drag."""
+    if kind == "structured":
+        mesh_structured(case, flow, n)
+        write_case(case, flow, wedge=flow.thickness is None)
+        case.run("simpleFoam")
+        return float(case.table("forces", "coefficient.dat")["Cd"][-1])
     domain = flow.domain()
     count = first if kind == "adapted" else n
     size = graded(flow, domain, n) if kind == "graded" else (float(domain.measure) / count) ** (1 / domain.cell_dim)
@@ -164,6 +258,19 @@ def solve(
     else:
         case.run("simpleFoam")
     return float(case.table("forces", "coefficient.dat")["Cd"][-1])
+
+
+def extrapolated(cells: list[float], drags: list[float]) -> tuple[float, float, float]:
+    """Return the drag for cells of no size, its uncertainty, and the observed order of its error in h, of three meshes.
+
+    The error is proportional to h^2, which is 1 / cells in the plane. The uncertainty is the difference to the value
+    without the finest mesh.
+    """
+    fine, coarse = (
+        float(np.polyfit(1 / np.array(cells[rows]), drags[rows], 1)[1]) for rows in (slice(-2, None), slice(-3, -1))
+    )
+    order = math.log(abs((drags[-3] - drags[-2]) / (drags[-2] - drags[-1])), math.sqrt(cells[-1] / cells[-2]))
+    return fine, abs(fine - coarse), order
 
 
 def draw(records: list[dict[str, Any]], case: Case, flow: Flow, path: Path) -> None:
@@ -205,6 +312,7 @@ def main() -> None:
     for kind in ("uniform", "graded", "adapted"):
         options_of.add_argument(f"--{kind}", type=counts, metavar="LIST")
     options_of.add_argument("--first", type=int, metavar="N", help="cells of the first mesh; by default as many")
+    options_of.add_argument("--reference", type=counts, metavar="LIST", help="cells of three or more structured meshes")
     options_of.add_argument("--cycles", type=int, default=4)
     options_of.add_argument("--samples", type=int, default=1)
     options_of.add_argument("--pictures", type=Path, metavar="FOLDER")
@@ -212,11 +320,12 @@ def main() -> None:
     require("simpleFoam")
     flow, adapter, report = FLOWS[options.flow], make_adapter(options), Report(options.json, COLUMNS)
     with tempfile.TemporaryDirectory() as folder:
-        for kind, default in flow.cells.items():
-            given = getattr(options, kind)
-            for n in counts(default) if given is None else given:
+        asked = {kind: getattr(options, kind) for kind in flow.cells}
+        lists = {kind: counts(flow.cells[kind]) if given is None else given for kind, given in asked.items()}
+        for kind, many_cells in {"structured": options.reference or [], **lists}.items():
+            for n in many_cells:
                 found: dict[str, Any] = {"cells": [], "drag": [], "error": [], "seconds": []}
-                for sample in range(options.samples):
+                for sample in range(1 if kind == "structured" else options.samples):
                     case, start = Case(Path(folder) / f"{kind}-{n}-{sample}"), time.perf_counter()
                     case.folder.mkdir()
                     many = round(n * (1 + 0.01 * sample))
@@ -231,6 +340,10 @@ def main() -> None:
             options.pictures.mkdir(parents=True, exist_ok=True)
             draw(report.records, case, flow, options.pictures / f"{options.flow}.png")
     report.finish(heading(adapter, f"Drag of the {options.flow}, reference {flow.drag}"))
+    if options.reference and len(options.reference) > 2:
+        found = [row for row in report.records if row["mesh"] == "structured"]
+        drag, off, order = extrapolated(*([statistics.median(row[key]) for row in found] for key in ("cells", "drag")))
+        print(f"Reference by Richardson: {drag:.5f} +- {off:.5f}, observed order {order:.2f}")
 
 
 if __name__ == "__main__":
