@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -42,6 +43,10 @@ class ResultParts:
     def labels(self) -> np.ndarray:
         """Names of the cells in the whole mesh, in the order of the rows of the result."""
         return np.sort(self.rows.labels)
+
+    def together(self, work: Callable[[], None]) -> None:
+        """Call `work` in all parts. An error in one of them is raised in all."""
+        self.engine.peers.agree(work, lambda _: "")
 
     def gather(self, result: Result) -> Result | None:
         """Return the whole mesh on part 0, and None on the others."""

@@ -24,7 +24,7 @@ from .foam import write_foam
 from .npz import load as load_npz
 from .npz import write_npz
 from .ugrid import write_ugrid
-from .vtu import write_vtu
+from .vtu import write_pvtu, write_vtu
 from .vtu_read import load_vtu
 
 if TYPE_CHECKING:
@@ -171,6 +171,7 @@ def _write_netcdf(contents: Contents, path: Path, convention: str = "ugrid", uni
 _WRITERS: dict[str, Callable[..., None]] = {
     ".npz": write_npz,
     ".vtu": write_vtu,
+    ".pvtu": write_pvtu,
     ".foam": write_foam,
     ".cgns": write_cgns,
     ".nc": _write_netcdf,

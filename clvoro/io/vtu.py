@@ -7,6 +7,7 @@ length, or a table of its compressed blocks.
 from __future__ import annotations
 
 import json
+import re
 import struct
 import sys
 import zlib
@@ -90,6 +91,46 @@ _"""
         for chunk in appended.chunks:
             file.write(chunk)
         file.write(b"\n</AppendedData>\n</VTKFile>\n")
+
+
+def write_pvtu(contents: Contents, path: Path) -> None:
+    """Write the mesh of all ranks for ParaView: each rank its cells to a file ``NAME_0.vtu``, ..., rank 0 their index.
+
+    The mesh of a single process has one piece. Marks of named boundaries, which ranks do not share, are in pieces only.
+    """
+    parts = None if contents.result is None else contents.result.parts
+    number, count = (0, 1) if parts is None else (parts.number, parts.count)
+    pieces = [f"{path.stem}_{k}.vtu" for k in range(count)]
+
+    def write_piece() -> None:
+        write_vtu(contents, path.with_name(pieces[number]))
+
+    write_piece() if parts is None else parts.together(write_piece)
+    if number:
+        return
+    declared = _Appended(compress=False)
+    # Elements without the places of bytes in a file.
+    shapes = {name: a[:0] for name, a in cell_data(contents).items() if not name.startswith("boundary:")}
+    data = [_PLACE.sub("", declared.add(name, a)).replace("DataArray", "PDataArray") for name, a in shapes.items()]
+    sources = [f"<Piece Source={quoteattr(piece)}/>" for piece in pieces]
+    text = f"""<?xml version="1.0"?>
+<VTKFile type="PUnstructuredGrid" version="1.0" byte_order="{sys.byteorder.title()}Endian" header_type="UInt64">
+<PUnstructuredGrid GhostLevel="0">
+<PPoints>
+<PDataArray type="Float64" NumberOfComponents="3"/>
+</PPoints>
+<PCellData Scalars="{"volume" if contents.result is None else "error"}" Vectors="generator">
+{_lines(data)}
+</PCellData>
+{_lines(sources)}
+</PUnstructuredGrid>
+</VTKFile>
+"""
+    with atomic_file(path) as file:
+        file.write(text.encode())
+
+
+_PLACE = re.compile(' format="appended" offset="[0-9]*"')
 
 
 def _diagram_data(diagram: Diagram) -> dict[str, np.ndarray]:

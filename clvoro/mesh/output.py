@@ -135,6 +135,8 @@ class MeshOutput:
             Everything; `clvoro.load` reads it.
         ``.vtu``
             For ParaView and other VTK programs, and for `clvoro.load`; `to_vtu` has options.
+        ``.pvtu``
+            For ParaView: the cells of each rank of MPI in a ``.vtu`` file beside it. All ranks save together.
         ``.../constant/polyMesh`` or ``CASE/name.foam``
             A folder for OpenFOAM, alone or within a case that ParaView opens, too; `to_openfoam` has options.
         ``.cgns``

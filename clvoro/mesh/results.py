@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Protocol, overload
 
@@ -64,6 +64,10 @@ class OtherParts(Protocol):
 
     def gather(self, result: Result) -> Result | None:
         """See `Result.gather`."""
+        ...
+
+    def together(self, work: Callable[[], None]) -> None:
+        """Call `work` in all parts. An error in one of them is raised in all."""
         ...
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from functools import partial
-from typing import TypeVar, cast
+from typing import Any, TypeVar, cast
 
 import numpy as np
 
@@ -34,7 +34,7 @@ def take_subset(mesh: Mesh, keep: object, boundary: str | np.ndarray) -> Mesh:
     if kept.all():
         return mesh
     globe = diagram.domain.globe
-    make = _in_space if globe is None else partial(_on_sphere, sphere=globe)
+    make: Any = _in_space if globe is None else partial(_on_sphere, sphere=globe)
     part = make(diagram, kept, boundary)
     if not isinstance(mesh, Result):
         return cast("Mesh", part)

@@ -40,13 +40,15 @@ except Exception as error:
 """
 
 
-def run_in(parts, ctx, *given, dtype="float64", **options):
-    """Return the results of `parts` threads, each with an adapter, and the whole mesh."""
+def run_in(parts, ctx, *given, dtype="float64", path=None, **options):
+    """Return the results of `parts` threads, each with an adapter, and the whole mesh; save them to `path`."""
 
     def work(peers):
         adapter = clvoro.Adapter(ctx, dtype)
         adapter._peers = peers
         mesh = adapter.run(*given, **options)
+        if path is not None:
+            mesh.save(path)
         return mesh, mesh.gather()
 
     found = run_parts(parts, work)
@@ -76,11 +78,14 @@ def test_the_diagram_has_the_same_bits_in_any_number_of_parts(ctx, dim, dtype):
 
 
 @pytest.mark.parametrize("dim", [2, 3])
-def test_a_run_in_parts(ctx, dim):
-    """Each part has its own cells, in balance; the whole has the sizes and shapes of a run without parts."""
+def test_a_run_in_parts(ctx, dim, tmp_path):
+    """Each part has its own cells, in balance; the whole has the sizes and shapes of a run without parts.
+
+    ParaView's library reads the pieces of all parts as one mesh.
+    """
     given = clvoro.Box((0,) * dim, (1,) * dim), ramp(0.05 if dim == 2 else 0.1)
     alone = clvoro.Adapter(ctx).run(*given, effort="fast")
-    meshes, whole = run_in(3, ctx, *given, effort="fast")
+    meshes, whole = run_in(3, ctx, *given, effort="fast", path=tmp_path / "mesh.pvtu")
     assert whole.check()
     sizes = [len(mesh) for mesh in meshes]
     assert sum(sizes) == len(whole)
@@ -97,6 +102,12 @@ def test_a_run_in_parts(ctx, dim):
         rows = np.searchsorted(np.sort(np.concatenate([m.parts.labels for m in meshes])), mesh.parts.labels)
         for array in ("points", "volumes", "size_error", "quality"):
             assert np.array_equal(getattr(mesh, array), getattr(whole, array)[rows])
+
+    pyvista = pytest.importorskip("pyvista")
+    read = pyvista.read(tmp_path / "mesh.pvtu")
+    assert read.n_cells == len(whole)
+    assert np.isclose(read.cell_data["volume"].sum(), 1)
+    assert np.array_equal(read.cell_data["error"], np.concatenate([mesh.size_error for mesh in meshes]))
 
 
 @pytest.mark.parametrize("change", [{"method": "transport"}, {"fixed": [(0.5, 0.5)]}, {"checkpoint": "run.npz"}])
