@@ -11,7 +11,7 @@ generators in the walls there complete the corner.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -104,66 +104,84 @@ def _unit(vectors: np.ndarray) -> np.ndarray:
 
 def place_stations(solid: Solid, size: Callable[[np.ndarray], np.ndarray]) -> Stations:
     """Return the stations of a solid for the sizes h = size(points (n, 3))."""
-    chains = [_Chain(solid, c, size) for c in np.unique(solid.creases.chain[solid.creases.concave]).tolist()]
+    chains = [_Crease(solid, c, size) for c in np.unique(solid.creases.chain[solid.creases.concave]).tolist()]
     chains = [chain for chain in chains if len(chain.h)]
-    _share_corners(chains)
-    placing = _AroundCreases(solid)
+    share_corners(chains)
+    placing = AroundCreases(lambda x: -solid.signed_distance(x))
     for chain in chains:
         placing.add(chain)
     placing.join()
     placing.leave_out()
-    placing.complete()
+    placing.complete(solid)
     return placing.stations()
 
 
-class _Chain:
-    """A chain that is divided into chords.
+class ChainOfChords:
+    """A chain that is divided into chords, with generators around each.
 
     Attributes
     ----------
     number : int
     vertices : (2,) int
         Those at its ends.
-    h, middle, angle : (n,) float
-        Of each chord: size, length along the chain, interior angle.
-    count : (n,) int
-        Number of generators.
+    h, middle : (n,) float
+        Of each chord: size, and length along the chain.
+    lengths, ways : (n,) and (n, 3) float
+        Of each chord: length, and unit vector.
     nodes, radii : (n + 1, 3) and (n + 1,) float
         The ends of the chords, and the distances of the generators from them.
+    turns : list of (k,) float
+        The angles of the generators around each chord.
+    axes : (n, 2, 3) float
+        Unit vectors across each chord, in the directions of the angles 0 and 90 degrees.
     """
 
-    def __init__(self, solid: Solid, number: int, size: Callable[[np.ndarray], np.ndarray]) -> None:
-        self.number, self.line = number, chain_line(solid, number)
-        self.vertices = solid.creases.vertices(number)[[0, -1]]
+    turns: list[np.ndarray]
+    axes: np.ndarray
+
+    def __init__(self, number: int, line: Line, vertices: np.ndarray, size: Callable[[np.ndarray], np.ndarray]) -> None:
+        self.number, self.line, self.vertices = number, line, vertices
         at, self.middle, self.h = _divide(self.line, size)
         self.nodes = self.line.along(self.line.points, at)
         chords = np.diff(self.nodes, axis=0)
         self.lengths = np.linalg.norm(chords, axis=1)
         self.ways = chords / self.lengths[:, None]
-        left, right = (self.line.along(n, self.middle) for n in (self.line.left, self.line.right))
-        self.left, right = (_unit(n - (n * self.ways).sum(axis=1)[:, None] * self.ways) for n in (left, right))
-        sine, cosine = (np.cross(self.left, right) * self.ways).sum(axis=1), (self.left * right).sum(axis=1)
-        self.angle = math.pi - np.arctan2(sine, cosine)
-        self.count = np.maximum(2, np.rint(self.angle / (math.pi / 2))).astype(int)
-        half = 0.5 * self.angle / self.count
-        # A cell is a kite with the area h^2 whose tip is on the crease; its generator is at the centroid.
-        reach = self.h / np.sqrt(np.tan(half)) * (np.cos(half) + 1 / np.cos(half)) / 3
+
+    def set_radii(self, reach: np.ndarray) -> None:
+        """Set the radii at the nodes for generators at the distances `reach` (n,) from the chords."""
         radii = np.hypot(reach, 0.5 * self.lengths)
         before, after = (radii[-1:], radii[:1]) if self.line.closed else (radii[:1], radii[-1:])
         self.radii = 0.5 * (np.append(before, radii) + np.append(radii, after))
+
+    @property
+    def count(self) -> np.ndarray:
+        """Number of generators around each chord, (n,) int."""
+        return np.array([len(turns) for turns in self.turns], int)
 
     def around(self, i: int) -> np.ndarray:
         """Return the generators beside chord `i`, (k, 3)."""
         (r, q), length, way = self.radii[i : i + 2], self.lengths[i], self.ways[i]
         foot = 0.5 * (length + (r * r - q * q) / length)
         height = math.sqrt(max(r * r - foot * foot, 0.0))
-        turn = (np.arange(self.count[i]) + 0.5) * (self.angle[i] / self.count[i])
-        across = np.cross(self.left[i], way)
-        return (
-            self.nodes[i]
-            + foot * way
-            + height * (np.cos(turn)[:, None] * across - np.sin(turn)[:, None] * self.left[i])
-        )
+        turn, (one, other) = self.turns[i], self.axes[i]
+        return self.nodes[i] + foot * way + height * (np.cos(turn)[:, None] * one + np.sin(turn)[:, None] * other)
+
+
+class _Crease(ChainOfChords):
+    """A concave crease: generators in the middle of equal sectors of its interior angle."""
+
+    def __init__(self, solid: Solid, number: int, size: Callable[[np.ndarray], np.ndarray]) -> None:
+        super().__init__(number, chain_line(solid, number), solid.creases.vertices(number)[[0, -1]], size)
+        left, right = (self.line.along(n, self.middle) for n in (self.line.left, self.line.right))
+        left, right = (_unit(n - (n * self.ways).sum(axis=1)[:, None] * self.ways) for n in (left, right))
+        sine, cosine = (np.cross(left, right) * self.ways).sum(axis=1), (left * right).sum(axis=1)
+        angle = math.pi - np.arctan2(sine, cosine)
+        count = np.maximum(2, np.rint(angle / (math.pi / 2))).astype(int)
+        self.axes = np.stack([np.cross(left, self.ways), -left], axis=1)
+        self.turns = [(np.arange(n) + 0.5) * (a / n) for n, a in zip(count.tolist(), angle, strict=True)]
+        half = 0.5 * angle / count
+        # A cell is a kite with the area h^2 whose tip is on the crease; its generator is at the centroid.
+        self.set_radii(self.h / np.sqrt(np.tan(half)) * (np.cos(half) + 1 / np.cos(half)) / 3)
 
 
 def _divide(line: Line, size: Callable[[np.ndarray], np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -186,9 +204,9 @@ def _divide(line: Line, size: Callable[[np.ndarray], np.ndarray]) -> tuple[np.nd
     return at[::2], at[1::2], np.interp(at[1::2], s, h) * (reached[-1] / max(count, 1))
 
 
-def _share_corners(chains: list[_Chain]) -> None:
+def share_corners(chains: Sequence[ChainOfChords]) -> None:
     """Give the chains that meet in a corner one radius there."""
-    ends: dict[int, list[tuple[_Chain, int]]] = {}
+    ends: dict[int, list[tuple[ChainOfChords, int]]] = {}
     for chain in chains:
         for end in (0, -1):
             ends.setdefault(int(chain.vertices[end]), []).append((chain, end))
@@ -198,11 +216,11 @@ def _share_corners(chains: list[_Chain]) -> None:
             chain.radii[end] = radius
 
 
-class _AroundCreases:
-    """Collects generators and balls."""
+class AroundCreases:
+    """Collects generators and balls; `depth` returns the distances of points (n, 3) from walls, negative outside."""
 
-    def __init__(self, solid: Solid) -> None:
-        self.solid = solid
+    def __init__(self, depth: Callable[[np.ndarray], np.ndarray]) -> None:
+        self.depth = depth
         self.points, self.sizes, self.chains = np.zeros((0, 3)), np.zeros(0), np.zeros(0, np.int64)
         self.spots = np.zeros((0, 3))  # the middle of the chord of each generator
         self.balls: list[list[int]] = []  # of each generator
@@ -210,7 +228,7 @@ class _AroundCreases:
         self.radii: list[float] = []
         self.lost = np.zeros((0, 3))
 
-    def add(self, chain: _Chain) -> None:
+    def add(self, chain: ChainOfChords) -> None:
         """Add the generators and balls of a chain."""
         first, chord = len(self.centers), np.repeat(np.arange(len(chain.h)), chain.count)
         self.centers += list(chain.nodes)
@@ -222,6 +240,7 @@ class _AroundCreases:
         self.balls += [[first + i, first + i + 1] for i in chord.tolist()]
 
     def keep(self, kept: np.ndarray) -> None:
+        """Keep some of the generators."""
         self.points, self.sizes, self.chains = self.points[kept], self.sizes[kept], self.chains[kept]
         self.spots = self.spots[kept]
         self.balls = [balls for balls, k in zip(self.balls, kept.tolist(), strict=True) if k]
@@ -264,7 +283,7 @@ class _AroundCreases:
         """Leave out generators near others, near walls, or outside; note their places on creases."""
         if not len(self.points):
             return
-        keep = -self.solid.signed_distance(self.points) > _WALL * self.sizes
+        keep = self.depth(self.points) > _WALL * self.sizes
         for i, j in self.near_pairs():
             if keep[i] and keep[j]:
                 keep[j] = False
@@ -273,9 +292,9 @@ class _AroundCreases:
         keep &= ~np.isin(spot, spot[~keep])
         self.keep(keep)
 
-    def complete(self) -> None:
-        """Add the mirror images of generators at corners in the walls there."""
-        solid, creases = self.solid, self.solid.creases
+    def complete(self, solid: Solid) -> None:
+        """Add the mirror images of generators at corners in the walls of `solid` there."""
+        creases = solid.creases
         ends, count = np.unique(creases.edges[creases.concave].ravel(), return_counts=True)
         corners = np.intersect1d(ends[count > 1], solid.corners)
         if not len(self.points):
@@ -291,7 +310,7 @@ class _AroundCreases:
             added: list[np.ndarray] = []
             for _ in range(_ROUNDS):
                 images = (mine[:, None] - 2 * ((mine - x) @ walls.T)[:, :, None] * walls).reshape(-1, 3)
-                images = images[solid.signed_distance(images) < -_WALL * h]
+                images = images[self.depth(images) > _WALL * h]
                 new = 0
                 for image in images:
                     others = np.vstack([self.points, *added])
