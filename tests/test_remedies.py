@@ -1014,6 +1014,15 @@ TESTED_IN = {
     "expected a communicator of mpi4py": "adaptation/test_ranks.py::test_what_ranks_cannot_share_is_refused",
     "since ranks share the run": "adaptation/test_ranks.py::test_what_ranks_cannot_share_is_refused",
     "has other input than rank 0": "adaptation/test_ranks.py::test_parts_with_other_input_are_refused",
+    "surfaces are in space": "adaptation/test_surfaces.py::test_what_is_refused_at_the_door",
+    "cross or cover each other": "adaptation/test_surfaces.py::test_what_is_refused_at_the_door",
+    "surfaces are outside of ": "adaptation/test_surfaces.py::test_what_is_refused_at_the_door",
+    "surfaces are curved, but": "adaptation/test_surfaces.py::test_what_is_refused_at_the_door",
+    "surfaces reach a periodic side": "adaptation/test_surfaces.py::test_what_is_refused_at_the_door",
+    "has one side only": "adaptation/test_surfaces.py::test_what_is_refused_at_the_door",
+    "surfaces are on the walls": "adaptation/test_surfaces.py::test_surfaces_without_room_are_refused_with_the_place",
+    "an edge of a surface inside": "adaptation/test_surfaces.py::test_surfaces_without_room_are_refused_with_the_place",
+    "but the domain has surfaces inside": "adaptation/test_surfaces.py::test_surfaces_without_room_are_refused_with_the_place",
     "cells meet at a vertex": "tessellation/test_vertices.py::test_walks_around_a_vertex_end",
 }
 """Parts of texts of errors without a row, and the tests that raise them."""

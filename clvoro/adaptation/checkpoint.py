@@ -305,8 +305,7 @@ def _digest(positions: np.ndarray) -> str:
 
 def domain_fingerprint(domain: Domain) -> dict[str, Any]:
     """Return plain values that identify `domain` and determine the shapes of a file's arrays."""
-    lines = {} if domain.lines is None else {"lines": domain.lines.describe()}
-    described = json.dumps(domain.describe() | lines, sort_keys=True)
+    described = json.dumps(domain.describe() | domain.described_borders, sort_keys=True)
     return {
         "kind": type(domain).__name__,
         "lower": list(domain.lower),

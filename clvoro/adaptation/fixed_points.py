@@ -17,7 +17,6 @@ from ..arguments import FIRST_ROWS, check_points, coincident_pair, format_point,
 from ..errors import InputError, InputTypeError, MismatchWarning
 from ..geometry.domain import Domain
 from ..geometry.fixed_generators import FixedGenerators
-from ..geometry.lines.pairs import LinePairs, place_pairs
 from ..mesh.diagram import Diagram
 from ..mesh.read_only import read_only
 from .tuning import AT_WALL, BEHIND_WALL, CANDIDATES, CLEARINGS, CLOSE, ON_WALL
@@ -126,62 +125,24 @@ def check_room(points: np.ndarray, domain: Domain, free: Domain, rows: np.ndarra
         )
 
 
-def place_beside_lines(
-    domain: Domain, free: Domain, wells: np.ndarray, size: Callable[[np.ndarray], np.ndarray]
-) -> LinePairs:
-    """Return the generators beside the lines of `domain`, in its part `free` without layers.
-
-    Parameters
-    ----------
-    wells : (k, 2) array
-        Fixed generators of the caller.
-    size : callable
-        Sizes (n,) at points (n, 2).
+def check_beside_borders(pairs: FixedGenerators, domain: Domain, wells: np.ndarray) -> None:
+    """Check that generators `wells` (k, d) of the caller are outside of the balls around the borders of `domain`.
 
     Raises
     ------
     InputError
-        If a generator of the caller is too near to a line for the size there.
-
-    Warns
-    -----
-    MismatchWarning
-        If a line is left out at a place without room, or in layers; says where.
+        If one is too near to a border for the size there.
     """
-    assert domain.lines is not None
-    network = domain.lines.network(free)
-    pairs = place_pairs(free, network, size)
-    if free is not domain:
-        if domain.lines.inside(free).length < (1 - 1e-9) * domain.lines.inside(domain).length:
-            warn(
-                "lines end where the layers of walls begin, which have generators of their own; leave out the layers "
-                "of the walls that the lines reach, if faces have to lie on them there",
-                MismatchWarning,
-            )
-    if len(pairs.left_out):
-        x = pairs.left_out[0]
-        if domain.holes is not None:
-            raise InputError(
-                f"outlines of holes have no room at {format_point(x)}: they are too near to each other for the size "
-                f"there, {float(np.asarray(size(x[None]))[0]):.3g}, or a corner has less than about 20 degrees; use "
-                "smaller sizes around it, move the holes apart, or make the corner blunt"
-            )
-        warn(
-            f"lines have no room at {format_point(x)}: they are too near to each other or meet at too small an angle "
-            f"for the size there, {float(np.asarray(size(x[None]))[0]):.3g}. A part of a line without faces on it "
-            "begins there; use smaller sizes around it, or leave out one of the lines",
-            MismatchWarning,
+    if domain.borders is None or not len(wells) or not len(pairs.centers):
+        return
+    gaps = np.linalg.norm(domain.wrap(wells)[:, None] - domain.wrap(pairs.centers), axis=2) / pairs.radii
+    i, b = np.unravel_index(gaps.argmin(), gaps.shape)
+    if gaps[i, b] < 1:
+        raise InputError(
+            f"fixed[{i}] is at {format_point(wells[i])}, {gaps[i, b] * pairs.radii[b]:.3g} from "
+            f"{domain.borders.word} at {format_point(pairs.centers[b])}, expected at least {pairs.radii[b]:.3g} for "
+            "the size there; move it or use smaller sizes"
         )
-    if len(wells) and len(pairs.centers):
-        gaps = np.linalg.norm(domain.wrap(wells)[:, None] - domain.wrap(pairs.centers), axis=2) / pairs.radii
-        i, b = np.unravel_index(gaps.argmin(), gaps.shape)
-        if gaps[i, b] < 1:
-            raise InputError(
-                f"fixed[{i}] is at {format_point(wells[i])}, {gaps[i, b] * pairs.radii[b]:.3g} from a line at "
-                f"{format_point(pairs.centers[b])}, expected at least {pairs.radii[b]:.3g} for the size there; move it "
-                "or use smaller sizes"
-            )
-    return pairs
 
 
 def place_in_corners(
@@ -294,12 +255,16 @@ def clear_balls(
     origin, scale = domain.frame
     centers, radii = (around.centers - origin) / scale, around.radii / scale
     period = domain.periods(np.dtype(np.float64)) if any(domain.periodic) else np.zeros(domain.dim)
-    tree = scipy.spatial.KDTree(np.mod(centers, np.where(period > 0, period, np.inf)), boxsize=period)
+
+    def folded(x: np.ndarray) -> np.ndarray:
+        return np.where(period > 0, np.mod(x, np.where(period > 0, period, 1.0)), x)
+
+    tree = scipy.spatial.KDTree(folded(centers), boxsize=period)
     moving = np.flatnonzero(labels >= n_fixed)
     x = points[moving].astype(np.float64)
     here: Any = np.arange(len(x))
     for _ in range(CLEARINGS):
-        near = tree.query_ball_point(np.mod(x[here], np.where(period > 0, period, np.inf)), radii.max())
+        near = tree.query_ball_point(folded(x[here]), radii.max())
         row = np.repeat(here, [len(balls) for balls in near])
         ball = np.concatenate([np.empty(0, int), *(np.array(balls, int) for balls in near)]).astype(int)
         way = x[row] - centers[ball]

@@ -23,13 +23,12 @@ from ..geometry.boundary_layers import (
 from ..geometry.domain import Domain
 from ..geometry.fixed_generators import FixedGenerators
 from ..geometry.gaps import NARROW
-from ..geometry.lines.pairs import place_pairs
 from ..sizing import Sizing, as_field
-from ..sizing.distance import limit_beside_layers, limit_beside_lines
+from ..sizing.distance import limit_beside_borders, limit_beside_layers
 from ..sizing.field import Field, on_domain
 from .diagnostics import check_precision, warn_of_mismatches, warn_of_narrow_parts
 from .estimates import SAMPLE, Extras, check_memory, check_prisms, expected_images, expected_surplus
-from .fixed_points import check_room, place_beside_lines, place_in_corners
+from .fixed_points import check_beside_borders, check_room, place_in_corners
 from .methods import MOVING, Relaxation, make_method
 from .moving.lattice import lattice_points
 from .options import Options
@@ -41,6 +40,9 @@ from .sampling.start import charted, density_tree, sample_density, sample_unifor
 from .stages import Stages
 from .state import MeshState, Setup
 from .tuning import CELLS_ACROSS, GRADIENT_STEP, LEAST_STEEP, MOVES, NEAR_SIZE, OPENINGS, SAMPLED_SIZES, STEPS
+
+_APART = 0.7
+"""Least distance of generators around concave creases from those beside surfaces inside, over h."""
 
 
 @dataclass(frozen=True)
@@ -131,8 +133,8 @@ def prepare(
     _check_together(domain, points, fixed, options)
     given_field = on_domain(domain, as_field(size))
     rows, free, field = _place_layers(stages, domain, given_field, options, len(fixed))
-    if domain.lines is not None:
-        field = limit_beside_lines(field, place_pairs(free, domain.lines.network(free), field))
+    if domain.borders is not None:
+        field = limit_beside_borders(field, *domain.borders.narrow_places(free, field))
     kept_rows = None
     if points is not None and domain.extrudes_layers and options.layers:
         kept_rows = np.flatnonzero(beyond_layers(domain, options.layers, points))
@@ -156,7 +158,7 @@ def prepare(
     own = 1.0
     if not options.multilevel and (tree is not None or domain.cutting_edges):
         own = _own_factor(sizing, free, tree, target)
-    scale = factor if domain.lines is not None else factor * own
+    scale = factor if domain.borders is not None else factor * own
     around = _place_around(domain, free, fixed, rows, lambda x: scale * np.asarray(sizing(x)), target, tree is not None)
     if around is not None:
         fixed = np.concatenate([fixed, around.points])
@@ -181,14 +183,18 @@ def _place_around(
     target: int,
     drawn: bool,
 ) -> FixedGenerators | None:
-    """Return generators beside lines, or, where the others are `drawn` at random, in corners and creases, if any."""
-    if domain.lines is None:
+    """Return generators beside borders, and, where the others are `drawn` at random, in corners and creases, if any."""
+    if domain.borders is None:
         return place_in_corners(domain, free, fixed, rows, size, target) if drawn else None
-    around = place_beside_lines(domain, free, fixed, size)
+    around = domain.borders.place(domain, free, size)
+    check_beside_borders(around, domain, fixed)
+    if drawn and domain.borders.sheets is not None:
+        corners = place_in_corners(domain, free, fixed, rows, size, target)
+        around = around.with_others(corners, lambda x: _APART * np.asarray(size(x)))
     if (count := len(fixed) + len(around)) > target:
         raise InputError(
-            f"the mesh has {target} cells, but {count} generators are beside the lines or fixed, expected at least as "
-            "many cells; use smaller sizes, or more cells"
+            f"the mesh has {target} cells, but {count} generators are beside the {domain.borders.word} or fixed, "
+            "expected at least as many cells; use smaller sizes, or more cells"
         )
     return around
 
@@ -207,8 +213,9 @@ def _check_together(domain: Domain, points: np.ndarray | None, fixed: np.ndarray
         domain.require_no_holes("n_cells is given")
     if method == "transport":
         domain.require_power_diagrams()
-    if (len(fixed) or domain.lines) and method in ("transport", *MOVING):
-        given = "fixed generators are given" if len(fixed) else "the domain has lines"
+    if (len(fixed) or domain.borders) and method in ("transport", *MOVING):
+        inside = domain.borders.word if domain.borders else ""
+        given = "fixed generators are given" if len(fixed) else f"the domain has {inside}"
         raise InputError(f"{given}, but method {method!r} moves all generators; use method='adaptive' or 'exact'")
     kept = points is not None and not options.multilevel
     if points is not None and kept and n_cells not in (None, len(points)):

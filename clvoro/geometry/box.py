@@ -123,11 +123,11 @@ class Box(Domain):
         self.require_plane("holes are in the plane", "use a clvoro.Solid")
         if not any(self.periodic):
             raise InputError(f"{self} has no periodic direction; write clvoro.Polygon(outline, holes)")
-        if self.lines is not None:
+        if self.borders is not None:
             raise InputError("the box has lines or holes already, expected one of them; give all holes at once")
         made = Box(**self.describe())
         found = Obstacles(made, holes, names)
-        vars(made).update(lines=found, holes=found)
+        vars(made).update(borders=found, holes=found)
         return made
 
     def __repr__(self) -> str:

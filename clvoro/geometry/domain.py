@@ -24,8 +24,8 @@ if TYPE_CHECKING:
     import pyopencl.array as cla
 
     from ..opencl.engine import Engine
+    from .borders import Borders
     from .fixed_generators import FixedGenerators
-    from .lines.lines import Lines
     from .lines.obstacles import Obstacles
     from .polygon import Polygon
     from .sphere import Sphere
@@ -81,16 +81,16 @@ class Domain(ClipBox):
         Directions in which the domain is periodic.
     names : mapping or None
         The caller's names of boundaries.
-    lines : Lines or None
-        Lines inside, on which faces of cells lie; see `with_lines`.
+    borders : Borders or None
+        Lines or surfaces inside, on which faces of cells lie; see `with_lines` and `with_surfaces`.
     holes : Obstacles or None
-        The same lines if their insides are removed from meshes; see `Box.without`.
+        The same borders if their insides are removed from meshes; see `Box.without`.
     """
 
     lower: tuple[float, ...]
     upper: tuple[float, ...]
     names: Mapping[str, Walls] | None = None
-    lines: Lines | None = None
+    borders: Borders | None = None
     holes: Obstacles | None = None
 
     def with_lines(self, lines: object) -> Domain:
@@ -115,7 +115,7 @@ class Domain(ClipBox):
         >>> fault = [(0.3, 0.2), (1.6, 0.8)]
         >>> ground = clvoro.Box((0, 0), (2, 1)).with_lines([fault, [(0, 0.6), (2, 0.5)]])
         >>> mesh = clvoro.adapt(ground, 0.1, "fast")
-        >>> covered = mesh.diagram.faces.area[mesh.diagram.line_faces].sum() / ground.lines.inside(ground).length
+        >>> covered = mesh.diagram.faces.area[mesh.diagram.border_faces].sum() / ground.borders.inside(ground).length
         >>> round(float(covered), 9), sorted(set(mesh.diagram.cell_region.tolist()))
         (1.0, [0, 1])
         """
@@ -127,8 +127,52 @@ class Domain(ClipBox):
         found = Lines(lines)
         if not len(found.network(made).chains):
             raise InputError(f"lines are outside of {self}, expected a part of one inside; do units of length agree?")
-        vars(made)["lines"] = found
+        vars(made)["borders"] = found
         return made
+
+    def with_surfaces(self, surfaces: object, angle: float = 30.0) -> Domain:
+        """Return the same domain in 3D with surfaces inside, on which faces of the cells of a run lie.
+
+        Such surfaces bound porous zones, solid parts for conjugate heat transfer, and other regions with cells of their
+        own; or they are baffles, fracture planes, layers of rock. Generators stand beside them in pairs that are mirror
+        images, about h apart, and do not move. Surfaces may be open or closed, meet in common edges, and reach walls.
+
+        Parameters
+        ----------
+        surfaces : Solid, Surface, path, mesh of trimesh, (vertices, triangles), list or mapping of these
+            What is outside of the domain is left out. Names of a mapping or a file are those of the regions inside of
+            closed surfaces, and of the faces on them.
+        angle : float
+            Edges at which a surface turns by more than this, in degrees, become edges of cells.
+
+        Raises
+        ------
+        InputError, InputTypeError
+            If the domain is not in space, or surfaces cross each other, reach a periodic side, or are not in the
+            domain.
+
+        Examples
+        --------
+        >>> heater = clvoro.Solid.box((0.3, 0.3, 0.3), (0.7, 0.7, 0.7))
+        >>> room = clvoro.Box((0, 0, 0), (1, 1, 1)).with_surfaces({"heater": heater})
+        >>> d = clvoro.adapt(room, 0.1, "fast").diagram
+        >>> d.region_names, [round(float(d.volumes[d.cell_region == k].sum()), 6) for k in range(2)]
+        (['region-0', 'heater'], [0.936, 0.064])
+        """
+        from .surfaces.surfaces import Surfaces
+
+        if self.cell_dim != 3:
+            raise InputError(f"surfaces are in space, but the domain is {self}; use with_lines in the plane")
+        made = type(self).described(**self.describe())
+        found = Surfaces(surfaces, angle)
+        found.check_within(made)
+        vars(made)["borders"] = found
+        return made
+
+    @property
+    def described_borders(self) -> dict[str, Any]:
+        """What describes the borders inside, for files."""
+        return {} if self.borders is None else {self.borders.word: self.borders.describe()}
 
     @cached_property
     def periodic(self) -> tuple[bool, ...]:

@@ -57,6 +57,23 @@ class FixedGenerators:
     def __len__(self) -> int:
         return len(self.points)
 
+    def with_others(self, others: FixedGenerators | None, room: Callable[[np.ndarray], np.ndarray]) -> FixedGenerators:
+        """Return these and `others`, without those of them that are within room(points) of these."""
+        if others is None or not len(others):
+            return self
+        away = scipy.spatial.KDTree(self.points).query(others.points)[0]
+        kept = np.flatnonzero(away > room(others.points))
+        lists = [others.balls[others.ball_starts[k] : others.ball_starts[k + 1]] for k in kept.tolist()]
+        ends = self.ball_starts[-1] + np.cumsum([len(balls) for balls in lists])
+        return FixedGenerators(
+            np.concatenate([self.points, others.points[kept]]),
+            np.concatenate([self.centers, others.centers]),
+            np.concatenate([self.radii, others.radii]),
+            np.concatenate([self.ball_starts, ends]).astype(np.int32),
+            np.concatenate([self.balls, *(balls + len(self.centers) for balls in lists)]).astype(np.int32),
+            np.concatenate([self.left_out, others.left_out]),
+        )
+
 
 @dataclass(frozen=True)
 class CornerStations(FixedGenerators):

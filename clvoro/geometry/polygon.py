@@ -350,7 +350,7 @@ class Polygon(Domain):
         return f"Polygon({', '.join(parts)} within {corners[0]} and {corners[1]})"
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return _described, (self.describe(),), {"lines": self.lines}
+        return _described, (self.describe(),), {"borders": self.borders}
 
     def describe(self) -> dict[str, Any]:
         """Return lists and numbers from which `described` makes an equal domain."""

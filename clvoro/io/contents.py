@@ -82,9 +82,9 @@ class Contents:
 
     @property
     def with_regions(self) -> dict[str, np.ndarray]:
-        """The caller's data, and the region of each cell if the domain has lines."""
-        of_lines = {} if self.diagram.domain.lines is None else {"region": self.diagram.cell_region}
-        return of_lines | self.extra
+        """The caller's data, and the region of each cell if the domain has borders inside."""
+        regions = {} if self.diagram.domain.borders is None else {"region": self.diagram.cell_region}
+        return regions | self.extra
 
     @property
     def of_run(self) -> dict[str, np.ndarray]:
@@ -127,8 +127,7 @@ def _in_known_type(array: np.ndarray) -> np.ndarray:
 
 def describe(domain: Domain) -> dict[str, Any]:
     """Return a domain of any kind as numbers, strings and lists."""
-    lines = {} if domain.lines is None else {"lines": domain.lines.describe()}
-    return {"kind": type(domain).__name__, **domain.describe(), **lines}
+    return {"kind": type(domain).__name__, **domain.describe(), **domain.described_borders}
 
 
 def described(description: Mapping[str, Any]) -> Domain:
@@ -144,6 +143,8 @@ def described(description: Mapping[str, Any]) -> Domain:
     if kind not in Domain.kinds:
         known = ", ".join(Domain.kinds)
         raise FileError(f"its domain is a {kind!r:.40}, expected one of {known}; import the class before")
-    lines = values.pop("lines", None)
+    lines, surfaces = values.pop("lines", None), values.pop("surfaces", None)
     domain = Domain.kinds[kind].described(**values)
+    if surfaces is not None:
+        return domain.with_surfaces(surfaces)
     return domain if lines is None else domain.with_lines(lines)

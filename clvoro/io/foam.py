@@ -280,9 +280,10 @@ def write_foam(
     lists["boundary"] = _text(len(made), [_boundary(made, inner).encode("ascii")])
     if of_cells:
         lists["cellZones"] = _text(len(of_cells), [_zone(name, rows, "cell") for name, rows in of_cells.items()])
-    on_lines = _faces_on_lines(contents.diagram, mesh)
-    if len(on_lines):
-        lists["faceZones"] = _text(1, [_zone("lines", on_lines, "face")])
+    of_faces = _face_zones(contents.diagram, mesh)
+    if of_faces:
+        made = [_zone(name, rows, "face", against) for name, (rows, against) in of_faces.items()]
+        lists["faceZones"] = _text(len(made), made)
     # `faces` is moved last: a case without it is recognized as incomplete.
     with atomic_folder(folder / "faces") as target:
         for name in [*(zone for zone in _ZONES if zone in lists), *_FILES]:
@@ -307,11 +308,11 @@ def _header(name: str, note: str, binary: bool) -> str:
 
 
 def _zones(diagram: Diagram, given: Mapping[str, ArrayLike] | None) -> dict[str, np.ndarray]:
-    """Return the cells of each zone by name: of the regions between the domain's lines, and of the caller's zones."""
+    """Return the cells of each zone by name: of the regions between borders inside, and of the caller's zones."""
     found = {}
-    if diagram.domain.lines is not None:
+    if diagram.domain.borders is not None:
         regions = diagram.cell_region
-        found = {f"region-{k}": np.flatnonzero(regions == k) for k in range(regions.max() + 1)}
+        found = {name: np.flatnonzero(regions == k) for k, name in enumerate(diagram.region_names)}
     if not isinstance(given, Mapping | None):
         raise InputTypeError(
             f"zones is a {type(given).__name__}, expected a mapping from names to one bool per cell, such as "
@@ -321,7 +322,7 @@ def _zones(diagram: Diagram, given: Mapping[str, ArrayLike] | None) -> dict[str,
         if not isinstance(name, str) or not WORD.fullmatch(name) or name in found:
             raise InputError(
                 f"zones has the name {name!r:.60}, expected a word of ASCII letters, digits, _, . and -, and another "
-                "one than region-0, region-1, ... in a domain with lines; choose another name"
+                f"one than those of regions ({', '.join(diagram.region_names)}); choose another name"
             )
         mask = np.asarray(values)
         if mask.dtype != bool or mask.shape != (len(diagram),):
@@ -333,20 +334,28 @@ def _zones(diagram: Diagram, given: Mapping[str, ArrayLike] | None) -> dict[str,
     return found
 
 
-def _faces_on_lines(diagram: Diagram, mesh: Faces) -> np.ndarray:
-    """Return the inner faces of a mesh for OpenFOAM that lie on the lines of the domain, (k,) int."""
-    rows, n = diagram.line_faces, len(diagram)
-    of_lines = diagram.faces.owner[rows].astype(np.int64) * n + diagram.faces.neighbor[rows]
+def _face_zones(diagram: Diagram, mesh: Faces) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Return the inner faces of a mesh for OpenFOAM that lie on borders, by name; see `Borders.face_sets`."""
+    if diagram.domain.borders is None:
+        return {}
+    n, found = len(diagram), {}
     inner = slice(mesh.n_inner)
-    return np.flatnonzero(np.isin(mesh.owner[inner].astype(np.int64) * n + mesh.neighbor[inner], of_lines))
+    own, other = mesh.owner[inner].astype(np.int64), mesh.neighbor[inner].astype(np.int64)
+    forth, back = own * n + other, other * n + own
+    for name, (rows, against) in diagram.domain.borders.face_sets(diagram).items():
+        pair = diagram.faces.owner[rows].astype(np.int64) * n + diagram.faces.neighbor[rows]
+        some = np.flatnonzero(np.isin(forth, pair) | np.isin(back, pair))
+        turned = np.isin(forth[some], pair[against]) | np.isin(back[some], pair[~against])
+        found[name] = some, turned
+    return found
 
 
-def _zone(name: str, rows: np.ndarray, kind: Literal["cell", "face"]) -> bytes:
-    """Return a zone of cells or faces as text."""
+def _zone(name: str, rows: np.ndarray, kind: Literal["cell", "face"], against: np.ndarray | None = None) -> bytes:
+    """Return a zone of cells or faces as text; `against` (k,) says whether normals of faces point the other way."""
     labels = b"\n".join([b"%d" % len(rows), b"(", _numbers(rows).replace(b",", b"\n"), b")"])
     body = b"    type %bZone;\n    %bLabels List<label>\n%b;\n" % (kind.encode(), kind.encode(), labels)
-    if kind == "face":
-        body += b"    flipMap List<bool> %d(%b);\n" % (len(rows), b" ".join([b"0"] * len(rows)))
+    if against is not None:
+        body += b"    flipMap List<bool> %d(%b);\n" % (len(rows), b" ".join([b"%d" % turned for turned in against]))
     return b"%b\n{\n%b}\n" % (name.encode(), body)
 
 

@@ -309,22 +309,23 @@ class Diagram(MeshOutput):
 
     @cached_property
     def cell_region(self) -> np.ndarray:
-        """Region of each generator, (n,) int32: the lines of the domain divide it into regions, and 0 is the largest.
+        """Region of each cell, (n,) int32: lines or surfaces inside divide the domain, and 0 is the largest region.
 
-        All formats of files hold it, if the domain has lines: as cell data, or as zones of cells for OpenFOAM.
+        All formats of files hold it, if the domain has borders inside: as cell data, or as zones of cells for OpenFOAM.
         """
-        if self.domain.lines is None:
+        if self.domain.borders is None:
             return np.zeros(len(self), np.int32)
-        return self.domain.lines.region_of(self.domain, self.points)
+        return self.domain.borders.region_of_cells(self)
+
+    @property
+    def region_names(self) -> list[str]:
+        """Names of the regions: those of closed surfaces inside that have one, else ``region-0``, ``region-1``, ..."""
+        return ["region-0"] if self.domain.borders is None else self.domain.borders.region_names(self)
 
     @cached_property
-    def line_faces(self) -> np.ndarray:
-        """Rows of the `faces` that lie on the lines of the domain, (k,) int, such as the faces of a fault."""
-        lines, f = self.domain.lines, self.faces
-        if lines is None:
-            return np.empty(0, np.int64)
-        ends = f.points[f.corners.reshape(-1, 2)[: f.n_inner]]
-        return np.flatnonzero(lines.covers(self.domain, ends))
+    def border_faces(self) -> np.ndarray:
+        """Rows of the `faces` that lie on lines or surfaces inside the domain, (k,) int, such as those of a fault."""
+        return np.empty(0, np.int64) if self.domain.borders is None else self.domain.borders.faces_of(self)
 
     def cell(self, i: int) -> Cell:
         """Return one cell: generator, centroid, volume, neighbors, vertices and faces.

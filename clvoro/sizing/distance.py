@@ -17,7 +17,6 @@ from ..geometry.boundary_layers import Layers, chosen_segments, outer_segments
 from ..geometry.bvh import Tree
 from ..geometry.domain import Domain
 from ..geometry.lines.lines import Lines
-from ..geometry.lines.pairs import LinePairs
 from ..geometry.shapes import Circle, Edges, Polyline, Segment, shapes_of
 from ..geometry.surface import Surface
 from ..geometry.triangles import segment_distance2
@@ -269,8 +268,6 @@ def _item_boxes(begin: np.ndarray, end: np.ndarray, radius: np.ndarray) -> tuple
 
 _GROWTH = 1.2
 """Growth of sizes beyond layers of constant height."""
-_SMALLER = 0.8
-"""Sizes beside lines that count as smaller than the size field, as a share of it."""
 _CLASS = 1.4
 """Columns whose widths differ by less than this factor have one distance field."""
 
@@ -288,10 +285,9 @@ def limit_beside_layers(size: object, domain: Domain, layers: Sequence[Layers]) 
     return field
 
 
-def limit_beside_lines(field: Field, pairs: LinePairs) -> Field:
-    """Return `field`, limited beside lines whose cells are smaller, as lines are near to each other there."""
-    smaller = pairs.sizes < _SMALLER * np.asarray(field(pairs.chords.mean(axis=1)), float)
-    return _limited(field, pairs.chords[smaller], pairs.sizes[smaller], 1.0, math.log(_GROWTH))
+def limit_beside_borders(field: Field, segments: np.ndarray, sizes: np.ndarray) -> Field:
+    """Return `field`, limited to `sizes` (k,) at `segments` (k, 2, d), where borders are near to each other."""
+    return _limited(field, segments, sizes, 1.0, math.log(_GROWTH))
 
 
 def _limited(field: Field, segments: np.ndarray, widths: np.ndarray, width: float, slope: float) -> Field:

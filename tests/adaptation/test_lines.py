@@ -20,7 +20,7 @@ def mesh(ctx):
 def covered(mesh):
     """Return the share of the lines that faces lie on."""
     d = mesh.diagram
-    return d.faces.area[d.line_faces].sum() / d.domain.lines.inside(d.domain).length
+    return d.faces.area[d.border_faces].sum() / d.domain.borders.inside(d.domain).length
 
 
 @pytest.mark.sparse(4)
@@ -95,14 +95,14 @@ def test_regions_are_in_files(mesh, tmp_path):
         mesh.save(tmp_path / name)
         again = clvoro.load(tmp_path / name).diagram
         assert np.array_equal(again.cell_region, regions)
-        assert len(again.line_faces) == len(mesh.diagram.line_faces)
+        assert len(again.border_faces) == len(mesh.diagram.border_faces)
     mesh.save(tmp_path / "a.nc")
     assert b"region" in (tmp_path / "a.nc").read_bytes()
     mesh.to_openfoam(tmp_path / "case.foam", zones={"left": mesh.points[:, 0] < 1})
     folder = tmp_path / "constant" / "polyMesh"
     text = (folder / "cellZones").read_text()
     assert [text.count(f"\n{name}\n") for name in ("region-0", "region-1", "left")] == [1, 1, 1]
-    assert f"List<label>\n{len(mesh.diagram.line_faces)}\n" in (folder / "faceZones").read_text()
+    assert f"List<label>\n{len(mesh.diagram.border_faces)}\n" in (folder / "faceZones").read_text()
     clvoro.voronoi(BOX, mesh.points).to_openfoam(tmp_path / "case.foam")
     assert not list(folder.glob("*Zones"))
 
@@ -136,5 +136,5 @@ def test_what_does_not_go_with_lines_is_said(ctx):
 def test_pairs_in_part_of_a_domain():
     domain = BOX.with_lines([BED])
     half = clvoro.Box((0, 0), (1, 1))
-    pairs = place_pairs(half, domain.lines.network(half), lambda x: np.full(len(x), 0.1))
+    pairs = place_pairs(half, domain.borders.network(half), lambda x: np.full(len(x), 0.1))
     assert pairs.points[:, 0].max() < 1

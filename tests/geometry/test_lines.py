@@ -46,14 +46,14 @@ PAIRS = {
     ids=["list", "array", "lists", "shapely", "several", "dict", "collection", "text"],
 )
 def test_lines_are_taken_in_all_forms(source):
-    assert BOX.with_lines(source).lines.describe() == [[[0.3, 0.2], [1.6, 0.8]]]
+    assert BOX.with_lines(source).borders.describe() == [[[0.3, 0.2], [1.6, 0.8]]]
 
 
 def test_lines_are_read_from_a_file_and_polygons_are_rings(tmp_path):
     (tmp_path / "faults.geojson").write_text(json.dumps(LINE_STRING))
-    assert len(BOX.with_lines(tmp_path / "faults.geojson").lines) == 1
+    assert len(BOX.with_lines(tmp_path / "faults.geojson").borders) == 1
     ring = BOX.with_lines(shapely.box(0.5, 0.2, 1.5, 0.8))
-    assert [round(part.area, 9) for part in ring.lines.regions(ring)] == [1.4, 0.6]
+    assert [round(part.area, 9) for part in ring.borders.regions(ring)] == [1.4, 0.6]
 
 
 @pytest.mark.parametrize(
@@ -73,18 +73,18 @@ def test_what_is_no_line_in_the_domain_is_refused(domain, source, message):
 
 def test_regions_count_from_the_largest_and_join_at_seams():
     ground = BOX.with_lines([FAULT, BED])
-    assert ground.lines.region_of(ground, np.array([(0.1, 0.1), (1.9, 0.9), (1.9, 0.1)])).tolist() == [0, 1, 0]
+    assert ground.borders.region_of(ground, np.array([(0.1, 0.1), (1.9, 0.9), (1.9, 0.1)])).tolist() == [0, 1, 0]
     ring = clvoro.Box((0, 0), (2, 1), periodic=True).with_lines([[(0.0, 0.3), (2, 0.3)], [(0.0, 0.7), (2, 0.7)]])
-    regions = ring.lines.regions(ring)
+    regions = ring.borders.regions(ring)
     assert [round(part.area, 9) for part in regions] == [1.2, 0.8]
-    assert ring.lines.region_of(ring, np.array([(0.5, 0.1), (0.5, 0.9), (0.5, 0.5)])).tolist() == [0, 0, 1]
+    assert ring.borders.region_of(ring, np.array([(0.5, 0.1), (0.5, 0.9), (0.5, 0.5)])).tolist() == [0, 0, 1]
 
 
 def test_lines_stay_in_copies_of_the_domain():
     import copy
 
     for domain in (BOX.with_lines(FAULT), PAIRS["island"][0].with_lines(FAULT)):
-        assert copy.copy(domain).lines.describe() == domain.lines.describe()
+        assert copy.copy(domain).borders.describe() == domain.borders.describe()
         assert domain == type(domain).described(**domain.describe())
 
 
@@ -94,7 +94,7 @@ def test_pairs_make_faces_on_the_lines_wherever_other_generators_are(kind):
     domain, lines = PAIRS[kind]
     domain = domain.with_lines(lines)
     size = 0.08
-    pairs = place_pairs(domain, domain.lines.network(domain), lambda x: np.full(len(x), size))
+    pairs = place_pairs(domain, domain.borders.network(domain), lambda x: np.full(len(x), size))
     assert not len(pairs.left_out)
     assert domain.contains(pairs.points).all()
     period = np.where(domain.periodic, domain.extent, 0.0)
@@ -110,12 +110,12 @@ def test_pairs_make_faces_on_the_lines_wherever_other_generators_are(kind):
         assert distance[:, 1] == pytest.approx(distance[:, 0], rel=1e-9)
         assert (row < len(pairs.points)).all()
     length = np.hypot(*(pairs.chords[:, 1] - pairs.chords[:, 0]).T).sum()
-    assert length == pytest.approx(domain.lines.inside(domain).length, rel=1e-9 if kind != "crossing" else 0.01)
+    assert length == pytest.approx(domain.borders.inside(domain).length, rel=1e-9 if kind != "crossing" else 0.01)
     assert np.median(pairs.sizes) == pytest.approx(size if kind != "close" else 0.024, rel=0.2)
 
 
 def test_chords_follow_the_sizes():
     ground = BOX.with_lines([[(0.0, 0.5), (2.0, 0.5)]])
-    pairs = place_pairs(ground, ground.lines.network(ground), lambda x: 0.02 + 0.08 * x[:, 0])
+    pairs = place_pairs(ground, ground.borders.network(ground), lambda x: 0.02 + 0.08 * x[:, 0])
     middle = pairs.chords.mean(axis=1)[:, 0]
     assert pairs.sizes == pytest.approx(0.02 + 0.08 * middle, rel=0.1)

@@ -27,8 +27,9 @@ from ...geometry.curves import Curve
 from ...geometry.domain import Domain
 from ...geometry.geojson import FOREIGN, pieces_of_geojson
 from ...geometry.polygon import Polygon
-from ...geometry.solid.solid import Solid
+from ...geometry.solid.solid import Solid, unit_length
 from ...geometry.sphere import Sphere
+from ...geometry.surface_files import SOLIDS, FilePart, joined, read_parts
 from ...io.arrays import read_array
 from ...io.foam import PatchType
 from . import checks
@@ -502,6 +503,32 @@ def _ring(ring: Any) -> Any:
 Line = RingCurve | Annotated[list[Plane], Meta(min_length=2)]
 
 
+class SurfaceTable(Table):
+    """A surface inside, from a file."""
+
+    file: Text
+    units: Text | Positive | None = None
+    name: str | None = None
+
+
+def _with_surfaces(domain: Any, surfaces: Text | list[SurfaceTable] | None, folder: Path) -> Any:
+    """Return `domain` with the surfaces of a table: a file, or a list of files with names."""
+    if surfaces is None:
+        return domain
+    if isinstance(surfaces, str):
+        return domain.with_surfaces(locate(folder, surfaces))
+    made = []
+    for surface in surfaces:
+        path, unit = locate(folder, surface.file), unit_length(surface.units)
+        parts = [(part.name, (unit * part.vertices, part.triangles)) for part in read_parts(path, SOLIDS)]
+        if surface.name is None:
+            made += [{name: arrays} if name else arrays for name, arrays in parts]
+        else:
+            vertices, triangles, _ = joined([FilePart("", *arrays) for _, arrays in parts])
+            made.append({surface.name: (vertices, triangles)})
+    return domain.with_surfaces(made)
+
+
 def _with_lines(domain: Any, lines: Text | list[Line] | None, folder: Path) -> Any:
     """Return `domain` with the lines of a table: a file of GeoJSON, or a list of lines."""
     if lines is None:
@@ -518,11 +545,13 @@ class BoxTable(Kind, tag="box"):
     periodic: bool | list[bool] | None = None
     names: Names | None = None
     lines: Text | list[Line] | None = None
+    surfaces: Text | list[SurfaceTable] | None = None
     holes: list[Ring] | None = None
     hole_names: Names | None = None
 
     def build(self, folder: Path, domain: Any = None) -> Any:
-        made = _with_lines(Box(**self.given("lines", "holes", "hole_names")), self.lines, folder)
+        box = _with_surfaces(Box(**self.given("lines", "surfaces", "holes", "hole_names")), self.surfaces, folder)
+        made = _with_lines(box, self.lines, folder)
         if self.holes is not None and len(self.lower) == 2 and not any(made.periodic):
             raise InputError(
                 "domain is a box with holes and no periodic side; write it as "
@@ -584,14 +613,17 @@ class SolidTable(Kind, tag="solid"):
     angle: Positive | None = None
     join: NotNegative | None = None
     repair: bool | None = None
+    surfaces: Text | list[SurfaceTable] | None = None
 
     def build(self, folder: Path, domain: Any = None) -> Solid:
-        options = self.given("file", "units", "outside", "names")
+        options = self.given("file", "units", "outside", "names", "surfaces")
         path = locate(folder, self.file)
         if self.outside is None:
-            return Solid.read(path, self.units, names=self.names, **options)
-        box = Box(**self.outside.given())
-        return Solid.outside(Solid.read(path, self.units, **options), box, names=self.names)
+            made = Solid.read(path, self.units, names=self.names, **options)
+        else:
+            box = Box(**self.outside.given())
+            made = Solid.outside(Solid.read(path, self.units, **options), box, names=self.names)
+        return _with_surfaces(made, self.surfaces, folder)
 
 
 DomainTable = BoxTable | PolygonTable | SphereTable | SolidTable
@@ -700,6 +732,7 @@ def _keys(*tables: type[Table]) -> set[str]:
 HOMES = {
     "the case itself, above all tables": _keys(CaseTable),
     "[domain]": _keys(*get_args(DomainTable)),
+    "[[domain.surfaces]]": _keys(SurfaceTable),
     "[size]": _keys(*get_args(Size)[1:]),
     "[run]": _keys(RunSettings),
     "[[layers]]": _keys(LayersTable),

@@ -9,15 +9,19 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import shapely
 
-from ...arguments import format_point
-from ...errors import InputError, InputTypeError
+from ...arguments import format_point, warn
+from ...errors import InputError, InputTypeError, MismatchWarning
+from ..borders import Borders, Size
 from ..curves import Curve
 from ..geojson import read_geojson
 
 if TYPE_CHECKING:
+    from ...mesh.diagram import Diagram
     from ..domain import Domain
+    from .pairs import LinePairs
 
 _SNAP = 1e-7  # of the domain: an end that is so near to another line, or to a wall, lies on it
+_SMALLER = 0.8  # of the size field: sizes beside lines below this count as smaller
 _SAGITTA = 0.15  # of a chord: largest distance of its middle from the curve
 _EXPECTED = "points (k, 2), curves of clvoro.curves, lines or polygons of shapely, GeoJSON, or a list of these"
 
@@ -39,7 +43,7 @@ class Network(NamedTuple):
     ends: np.ndarray
 
 
-class Lines:
+class Lines(Borders):
     """Lines inside a domain; `Domain.with_lines` makes them. Also a shape for `clvoro.sizing.Distance`.
 
     Attributes
@@ -47,6 +51,8 @@ class Lines:
     paths : tuple of (k, 2) float64
         The vertices of each line. Curves are polylines within their tolerance.
     """
+
+    word = "lines"
 
     def __init__(self, source: object) -> None:
         self.paths = tuple(_without_repetitions(path) for path in _paths(source))
@@ -106,6 +112,62 @@ class Lines:
         place = np.rint((domain.wrap(ends + step / 2) - domain.lower) / step).astype(np.int64)
         _, first, index = np.unique(place, axis=0, return_index=True, return_inverse=True)
         return Network(ends[first], chains, np.reshape(index, (-1, 2)))
+
+    def place(self, domain: Domain, free: Domain, size: Size) -> LinePairs:
+        """Return the generators beside the lines of `domain`, in its part `free` without layers.
+
+        Raises
+        ------
+        InputError
+            If holes have no room.
+
+        Warns
+        -----
+        MismatchWarning
+            If a line is left out at a place without room, or in layers; says where.
+        """
+        from .pairs import place_pairs
+
+        pairs = place_pairs(free, self.network(free), size)
+        if free is not domain and self.inside(free).length < (1 - 1e-9) * self.inside(domain).length:
+            warn(
+                "lines end where the layers of walls begin, which have generators of their own; leave out the layers "
+                "of the walls that the lines reach, if faces have to lie on them there",
+                MismatchWarning,
+            )
+        if len(pairs.left_out):
+            x = pairs.left_out[0]
+            if domain.holes is not None:
+                raise InputError(
+                    f"outlines of holes have no room at {format_point(x)}: they are too near to each other for the "
+                    f"size there, {float(np.asarray(size(x[None]))[0]):.3g}, or a corner has less than about 20 "
+                    "degrees; use smaller sizes around it, move the holes apart, or make the corner blunt"
+                )
+            warn(
+                f"lines have no room at {format_point(x)}: they are too near to each other or meet at too small an "
+                f"angle for the size there, {float(np.asarray(size(x[None]))[0]):.3g}. A part of a line without faces "
+                "on it begins there; use smaller sizes around it, or leave out one of the lines",
+                MismatchWarning,
+            )
+        return pairs
+
+    def narrow_places(self, free: Domain, size: Size) -> tuple[np.ndarray, np.ndarray]:
+        """Return the chords (k, 2, 2) beside which cells are smaller than `size`, and the sizes there (k,)."""
+        from .pairs import place_pairs
+
+        pairs = place_pairs(free, self.network(free), size)
+        smaller = pairs.sizes < _SMALLER * np.asarray(size(pairs.chords.mean(axis=1)), float)
+        return pairs.chords[smaller], pairs.sizes[smaller]
+
+    def region_of_cells(self, diagram: Diagram) -> np.ndarray:
+        """Return the region of each cell, (n,) int32; see `regions`."""
+        return self.region_of(diagram.domain, diagram.points)
+
+    def faces_of(self, diagram: Diagram) -> np.ndarray:
+        """Return the rows of the faces of a mesh that lie on the lines, (k,) int."""
+        f = diagram.faces
+        ends = f.points[f.corners.reshape(-1, 2)[: f.n_inner]]
+        return np.flatnonzero(self.covers(diagram.domain, ends))
 
     def covers(self, domain: Domain, segments: np.ndarray) -> np.ndarray:
         """Return which of `segments` (n, 2, 2) lie on the lines with both ends and the chord between; (n,) bool."""

@@ -264,7 +264,7 @@ class _Placing:
         lengths = [h] * len(uses)
         radius, angles, behind = h, np.empty(0), np.empty(0)
         for _ in range(3):  # on a curved line the direction of a chord follows from its length
-            angles = _choose_angles([self.direction(u, s) for u, s in zip(uses, lengths, strict=True)], walls)
+            angles = choose_angles([self.direction(u, s) for u, s in zip(uses, lengths, strict=True)], walls)
             radius = min(h / math.sqrt(2 * max(float(np.sin(2 * angles).mean()), 0.2)), 1.2 * h)
             foot = radius * np.cos(angles)
             behind = np.minimum(foot, np.maximum(radius * np.sin(angles), _BEHIND * radius))
@@ -489,7 +489,7 @@ def _wall_directions(domain: Domain, nodes: np.ndarray) -> dict[int, list[float]
     return found
 
 
-def _choose_angles(chords: list[float], walls: list[float]) -> np.ndarray:
+def choose_angles(chords: list[float], walls: list[float]) -> np.ndarray:
     """Return for chords in the given directions around a node the angle between each and its generators, (k,).
 
     They are as close to 45 degrees as may be. Two neighboring chords share a generator, whose angles to both are equal

@@ -180,13 +180,13 @@ def find_creases(
     edges = np.column_stack([triangles[mine // 3, mine % 3], triangles[mine // 3, (mine + 1) % 3]])
     both = np.column_stack([mine, twin[mine]]) // 3
     angle = math.pi - turns[mine]
-    corners, order, flipped, chain = _chains(vertices, edges, patch[both], angle)
+    corners, order, flipped, chain = find_chains(vertices, edges, patch[both], angle)
     edges, both = edges[order], both[order]
     edges[flipped], both[flipped] = edges[flipped, ::-1], both[flipped, ::-1]
     return patch, Creases(edges, patch[both], both, angle[order], chain), corners
 
 
-def _chains(vertices: np.ndarray, edges: np.ndarray, patches: np.ndarray, angle: np.ndarray):
+def find_chains(vertices: np.ndarray, edges: np.ndarray, patches: np.ndarray, angle: np.ndarray):
     """Return the corners, and the edges in the order of chains: their rows, whether they are reversed, and chains."""
     ends, at = np.unique(edges, return_inverse=True)
     at = at.reshape(-1, 2)

@@ -288,7 +288,7 @@ class Solid(Domain):
         MissingLibraryError
             If the file needs a library that is not installed.
         """
-        unit = _unit_length(units)
+        unit = unit_length(units)
         return cls(**{**_from_parts(read_parts(path, SOLIDS), unit), "name": f"solid {str(path)!r}", **options})
 
     @classmethod
@@ -767,9 +767,9 @@ class Solid(Domain):
     def describe(self) -> dict[str, Any]:
         """Return the arguments of this solid as numbers and strings; arrays are compressed."""
         return {
-            "vertices": _packed(self.surface.vertices, "<f8"),
-            "triangles": _packed(self.surface.triangles, "<i8"),
-            "groups": _packed(self._group, "<i8"),
+            "vertices": pack_array(self.surface.vertices, "<f8"),
+            "triangles": pack_array(self.surface.triangles, "<i8"),
+            "groups": pack_array(self._group, "<i8"),
             "group_names": list(self._group_names),
             "angle": self.angle,
             **({"creases": self._drawn_edges.tolist()} if len(self._drawn_edges) else {}),
@@ -779,16 +779,16 @@ class Solid(Domain):
     @classmethod
     def described(cls, **values: Any) -> Solid:
         """Return the solid from the values that `describe` returns."""
-        values["vertices"] = _unpacked(values["vertices"], "<f8").reshape(-1, 3)
-        values["triangles"] = _unpacked(values["triangles"], "<i8").reshape(-1, 3)
-        values["groups"] = _unpacked(values["groups"], "<i8")
+        values["vertices"] = unpack_array(values["vertices"], "<f8").reshape(-1, 3)
+        values["triangles"] = unpack_array(values["triangles"], "<i8").reshape(-1, 3)
+        values["groups"] = unpack_array(values["groups"], "<i8")
         return cls(**values)
 
     def __repr__(self) -> str:
         return f"Solid({len(self.patch)} triangles, {self.n_patches} patches, volume {self.measure:.6g})"
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return _described, (self.describe(),)
+        return _described, (self.describe(),), {"borders": self.borders}
 
     def __hash__(self) -> int:
         return int(hashlib.sha256(self.surface.vertices.tobytes()).hexdigest()[:15], 16)
@@ -801,7 +801,7 @@ def _described(values: dict[str, Any]) -> Solid:
 _UNITS = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "km": 1e3, "um": 1e-6, "in": 0.0254, "ft": 0.3048}
 
 
-def _unit_length(units: str | float | None) -> float:
+def unit_length(units: str | float | None) -> float:
     """Return the length of a unit in meters."""
     if units is None:
         return 1.0
@@ -850,9 +850,11 @@ def _checked_groups(name: str, groups: object, count: int) -> np.ndarray:
     return array.astype(np.int64)
 
 
-def _packed(array: np.ndarray, dtype: str) -> str:
+def pack_array(array: np.ndarray, dtype: str) -> str:
+    """Return an array as compressed text."""
     return base64.b64encode(zlib.compress(np.ascontiguousarray(array, dtype).tobytes(), 6)).decode("ascii")
 
 
-def _unpacked(text: str, dtype: str) -> np.ndarray:
+def unpack_array(text: str, dtype: str) -> np.ndarray:
+    """Return the array (n,) of a text of `pack_array`."""
     return np.frombuffer(zlib.decompress(base64.b64decode(text)), dtype).copy()

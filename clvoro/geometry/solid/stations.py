@@ -33,6 +33,7 @@ _ROUNDS = 3  # of reflections at a corner
 _EXACT = 0.02  # of a radius: generators this near to a sphere are on it
 _CROWD = 16  # generators at a corner, about
 _ITERATIONS = 8  # of Newton's method
+_MOST_INNER = 500  # of the linear least squares in it
 
 
 @dataclass(frozen=True)
@@ -245,8 +246,11 @@ class AroundCreases:
         self.spots = self.spots[kept]
         self.balls = [balls for balls, k in zip(self.balls, kept.tolist(), strict=True) if k]
 
-    def join(self) -> None:
-        """Make one of two near generators of different chains, if there is a place on the spheres of both."""
+    def join(self, within: float = _EXACT) -> None:
+        """Make one of two near generators of different chains, if there is a place on the spheres of both.
+
+        `within` is how far it may be from the spheres, over their radii.
+        """
         if not len(self.points):
             return
         kept = np.ones(len(self.points), bool)
@@ -257,7 +261,7 @@ class AroundCreases:
             point = self.common_point(0.5 * (self.points[i] + self.points[j]), balls)
             near = np.linalg.norm(point - self.points[[i, j]], axis=1).max() < _ROOM * self.sizes[i]
             off = np.linalg.norm(point - np.array(self.centers)[balls], axis=1) / np.array(self.radii)[balls] - 1
-            if near and np.abs(off).max() < _EXACT:
+            if near and np.abs(off).max() < within:
                 self.points[i], self.balls[i] = point, balls
                 kept[j] = False
         self.keep(kept)
@@ -278,6 +282,26 @@ class AroundCreases:
             distance = np.linalg.norm(way, axis=1)
             point = point - np.linalg.lstsq(way / distance[:, None], distance - radii, rcond=1e-6)[0]
         return point
+
+    def fit(self) -> None:
+        """Move generators as little as may be, until those of each ball are equally far from its center."""
+        if not len(self.points):
+            return
+        ball, item = np.array([(b, k) for k, balls in enumerate(self.balls) for b in balls]).T
+        n, centers, start = len(self.points), np.array(self.centers), np.array(self.radii)
+        scale, radii = start[ball], start
+        for _ in range(_ITERATIONS):
+            # |x - c|^2 = r^2, linearized in the generators x and in r^2.
+            way = (self.points[item] - centers[ball]) / scale[:, None]
+            columns = [*(3 * item + a for a in range(3)), 3 * n + ball]
+            values = np.concatenate([*(2 * way.T / scale), -np.ones(len(ball)) / scale])
+            where = np.tile(np.arange(len(ball)), 4), np.concatenate(columns)
+            matrix = scipy.sparse.csr_array((values, where), (len(ball), 3 * n + len(radii)))
+            off = (radii[ball] / scale) ** 2 - (way**2).sum(axis=1)
+            step = scipy.sparse.linalg.lsmr(matrix, off, atol=1e-14, btol=1e-14, maxiter=_MOST_INNER)[0]
+            self.points = self.points + step[: 3 * n].reshape(n, 3)
+            radii = np.sqrt(np.maximum(radii**2 + step[3 * n :] * start, 0.25 * start**2))
+        self.radii = radii.tolist()
 
     def leave_out(self) -> None:
         """Leave out generators near others, near walls, or outside; note their places on creases."""

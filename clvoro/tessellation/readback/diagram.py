@@ -10,6 +10,7 @@ import numpy as np
 import pyopencl.array as cla
 import scipy
 
+from ...finite_volumes.borders import on_surfaces
 from ...geometry.domain import ClipBox, Domain
 from ...mesh.diagram import Diagram
 from ...opencl.engine import Engine
@@ -49,11 +50,18 @@ def fetch_diagram(engine: Engine, domain: Domain, t: Tessellation, labels: cla.A
 
         points, sizes = read_generators(domain, t, labels)
         del t, labels  # memory for another diagram
-        return make_mesh(engine, cast("Solid", domain), points, sizes)
+        return _on_borders(make_mesh(engine, cast("Solid", domain), points, sizes))
     reader = _DiagramReader(engine, domain, t, labels, copy)
     if reader.whole.round_off & UNEVEN:
         assert reader.faces
-    return reader.diagram()
+    return _on_borders(reader.diagram())
+
+
+def _on_borders(diagram: Diagram) -> Diagram:
+    """Return a mesh whose faces lie on the borders inside the domain, where those of `diagram` are only near them."""
+    borders = diagram.domain.borders
+    sheets = None if borders is None else borders.sheets
+    return diagram if sheets is None else on_surfaces(diagram, sheets)
 
 
 def make_diagram(stages: TessellationStages, domain: Domain, points: np.ndarray) -> Diagram:

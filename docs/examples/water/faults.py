@@ -22,9 +22,9 @@ outline = [(0, 0), (1800, -100), (3500, 100), (3600, 1500), (2400, 2300), (600, 
 faults = [[(500, 300), (1500, 1200), (2900, 1700)], [(1100, 2000), (2000, 600), (2200, 200)]]
 lens = clvoro.curves.ellipse((2700, 800), (400, 250))
 ground = clvoro.Polygon(outline, names={"river": range(2), "hills": range(2, 7)}).with_lines([*faults, lens])
-mesh = clvoro.adapt(ground, sizing.Distance(ground.lines, h_min=40, growth=1.15, h_max=110))
+mesh = clvoro.adapt(ground, sizing.Distance(ground.borders, h_min=40, growth=1.15, h_max=110))
 d = mesh.diagram
-print(f"{len(mesh)} cells, {len(d.line_faces)} faces on lines, regions with {np.bincount(d.cell_region)} cells")
+print(f"{len(mesh)} cells, {len(d.border_faces)} faces on lines, regions with {np.bincount(d.cell_region)} cells")
 
 # %%
 # The flow between two cells is the conductance of their face times the difference of their heads. The clay in the lens
@@ -36,7 +36,7 @@ i, j = f.owner[: f.n_inner], f.neighbor[: f.n_inner]
 lens_cells = d.cell_region == d.cell_region[d.locate([(2700, 800)])[0]]
 k = np.where(lens_cells, 5e-6, 5e-4)
 resistance = f.distance[: f.n_inner] / 2 * (1 / k[i] + 1 / k[j])
-on_fault = d.line_faces[lens_cells[i[d.line_faces]] == lens_cells[j[d.line_faces]]]
+on_fault = d.border_faces[lens_cells[i[d.border_faces]] == lens_cells[j[d.border_faces]]]
 resistance[on_fault] += 5.0 / 1e-6
 conductance = 20 * f.area[: f.n_inner] / resistance
 
@@ -55,6 +55,6 @@ head = scipy.sparse.linalg.spsolve(
 
 figure = mesh.plot(head, label="head [m]", edges=False)
 figure.axes[0].add_collection(
-    LineCollection(f.points[f.corners.reshape(-1, 2)[d.line_faces]], colors="black", linewidths=1)
+    LineCollection(f.points[f.corners.reshape(-1, 2)[d.border_faces]], colors="black", linewidths=1)
 )
 plt.show()

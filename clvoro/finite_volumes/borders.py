@@ -1,0 +1,187 @@
+"""Meshes whose faces lie on surfaces inside: small faces there are collapsed, vertices are moved onto the surfaces."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from ..geometry.solid.creases import connect
+from ..geometry.surfaces.sheets import Sheets
+from ..mesh.connectivity import distinct, following, take_rows
+from ..mesh.diagram import Diagram
+from ..mesh.faces import Faces
+from .collapse import collapse_short
+from .defects import DefectLimits
+from .solid_walls.mesh import diagram_of
+
+_SMALL = 0.15
+"""Faces on a surface that are smaller than this share of h^2 are between cells that are no pair."""
+_ON_EDGE, _ON_CORNER = 0.12, 0.2
+"""Vertices this near to an edge or a corner of a surface, over h, lie on it."""
+_FLAT = 1e-6
+"""Vertices this near to a surface, over h, are on it."""
+_NARROW, _TINY = 0.08, 1e-3
+"""Faces between cells at surfaces that are collapsed, over h^2, if a cell is concave there; and in any case."""
+_COLLAPSES = 3
+_ROUNDS = 4
+"""How often vertices at walls are moved to the surface, and back to the walls."""
+
+
+def on_surfaces(diagram: Diagram, sheets: Sheets) -> Diagram:
+    """Return a mesh whose faces between cells on both sides of `sheets` lie on them.
+
+    Pairs of generators are mirror images in tangent planes. On flat patches their faces are where they must be; on
+    others they are near, with narrow faces between them.
+    """
+    rows = diagram.border_faces
+    if not len(rows):
+        return diagram
+    faces = diagram.faces
+    h = np.cbrt(diagram.volumes)
+    of_face = np.minimum(h[faces.owner[rows]], h[faces.neighbor[rows]])
+    vertices, size = _vertices(faces, rows, of_face)
+    small = faces.area[rows] < _SMALL * of_face**2
+    if not small.any() and (sheets.distance(faces.points[vertices]) < _FLAT * size).all():
+        return diagram
+    mesh = replace(faces, diagram=None, points=faces.points.astype(np.float64), corners=faces.corners.astype(np.int32))
+    if small.any():
+        mesh = _with_pairs_only(mesh, rows, small, vertices)
+    made = _moved(mesh, sheets, h)
+    for _ in range(_COLLAPSES):
+        narrow = _narrow_faces(made, h)
+        if not narrow.any():
+            break
+        made = _moved(collapse_short(made.faces, made, narrow, narrow), sheets, h)
+    return made
+
+
+def _moved(mesh: Faces, sheets: Sheets, h: np.ndarray) -> Diagram:
+    """Return the mesh with the vertices of faces on surfaces moved onto these; `h` (n,) are sizes of cells."""
+    rows = diagram_of(mesh).border_faces
+    vertices, size = _vertices(mesh, rows, np.minimum(h[mesh.owner[rows]], h[mesh.neighbor[rows]]))
+    points = mesh.points.copy()
+    points[vertices] = _onto(mesh, sheets, vertices, size)
+    return diagram_of(replace(mesh, points=points, diagram=None))
+
+
+def _narrow_faces(diagram: Diagram, h: np.ndarray) -> np.ndarray:
+    """Return the small faces with which cells at surfaces are concave, and those nearly without an area, (f,) bool."""
+    mesh, rows = diagram.faces, diagram.border_faces
+    beside = np.zeros(mesh.n_cells, bool)
+    beside[mesh.owner[rows]] = beside[mesh.neighbor[rows]] = True
+    size = np.minimum(h[mesh.owner], h[np.maximum(mesh.neighbor, 0)]) ** 2
+    chosen = np.zeros(len(mesh), bool)
+    chosen[mesh.measures.concave_pairs(DefectLimits().concavity, beside)[0]] = True
+    chosen &= mesh.area < _NARROW * size
+    chosen |= (mesh.area < _TINY * size) & (beside[mesh.owner] | beside[np.maximum(mesh.neighbor, 0)])
+    chosen[mesh.n_inner :] = False
+    return chosen
+
+
+def _with_pairs_only(mesh: Faces, rows: np.ndarray, small: np.ndarray, vertices: np.ndarray) -> Faces:
+    """Return `mesh` without the `small` ones of the faces `rows` on surfaces.
+
+    The cells that share a large face on a surface have one name, and a vertex has those of the cells that meet there,
+    and its walls. Vertices with equal names are one; so are those with four names and their neighbors with three of
+    them. A small face between two names has lost its area then.
+    """
+    n = mesh.n_cells
+    pairs = np.stack([mesh.owner[rows[~small]], mesh.neighbor[rows[~small]]], axis=1)
+    name = connect(n, pairs)[1]
+    on_border = np.zeros(n, bool)
+    on_border[mesh.owner[rows]] = on_border[mesh.neighbor[rows]] = True
+    place = np.full(len(mesh.points), -1)
+    place[vertices] = np.arange(len(vertices))
+    at = place[mesh.corners]
+    face = np.repeat(np.arange(len(mesh)), np.diff(mesh.starts))
+    at, face = at[at >= 0], face[at >= 0]
+    other = mesh.neighbor[face]
+    both = [np.stack([at, name[mesh.owner[face]]], axis=1)[on_border[mesh.owner[face]]]]
+    inner = (other >= 0) & on_border[np.maximum(other, 0)]
+    both += [np.stack([at, name[np.maximum(other, 0)]], axis=1)[inner], np.stack([at, other], axis=1)[other < 0]]
+    found = np.unique(np.concatenate(both), axis=0)
+    starts = np.searchsorted(found[:, 0], np.arange(len(vertices) + 1))
+    names = [tuple(found[starts[k] : starts[k + 1], 1].tolist()) for k in range(len(vertices))]
+    # Sides of small faces: those whose ends have the same names, or more.
+    starts, corners = take_rows(mesh.starts, mesh.corners, rows[small])
+    begin, end = place[corners], place[corners[following(starts)]]
+    joined = []
+    for i, j in zip(begin.tolist(), end.tolist(), strict=True):
+        one, two = names[i], names[j]
+        if one == two or (max(len(one), len(two)) > 3 and (set(one) <= set(two) or set(two) <= set(one))):
+            joined.append((i, j))
+    group = connect(len(vertices), np.array(joined, int).reshape(-1, 2))[1]
+    count = np.bincount(group)
+    x = np.stack([np.bincount(group, c) for c in mesh.points[vertices].T], axis=1) / count[:, None]
+    first = vertices[np.unique(group, return_index=True)[1]]
+    points, to = mesh.points.copy(), np.arange(len(mesh.points))
+    points[first], to[vertices] = x, first[group]
+    return _relabeled(replace(mesh, points=points), to)
+
+
+def _relabeled(mesh: Faces, to: np.ndarray) -> Faces:
+    """Return a mesh whose vertices have become the vertices `to` (v,); faces with less than three are left out."""
+    touched = np.unique(np.repeat(np.arange(len(mesh)), np.diff(mesh.starts))[to[mesh.corners] != mesh.corners])
+    corners, starts = to[mesh.corners], mesh.starts
+    loops = {}
+    for f in touched.tolist():
+        loop = corners[starts[f] : starts[f + 1]].tolist()
+        changed = True
+        while changed and len(loop) > 2:
+            changed = False
+            for k in range(len(loop)):
+                if loop[k] == loop[k - 1]:
+                    del loop[k]
+                elif loop[k - 2] == loop[k]:  # there and back
+                    for m in sorted(((k - 1) % len(loop), k), reverse=True):
+                        del loop[m]
+                else:
+                    continue
+                changed = True
+                break
+        loops[f] = loop
+    kept = np.array([f not in loops or len(loops[f]) > 2 for f in range(len(mesh))], bool)
+    rows = np.flatnonzero(kept)
+    lists = [loops.get(f) or corners[starts[f] : starts[f + 1]].tolist() for f in rows.tolist()]
+    begin = np.concatenate([[0], np.cumsum([len(loop) for loop in lists])])
+    flat = np.array([c for loop in lists for c in loop], np.int32)
+    return mesh.take_faces(rows, starts=begin, corners=flat).compact()
+
+
+def _vertices(faces: Faces, rows: np.ndarray, size: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the corners of some faces, each once, and the least of the sizes of their faces."""
+    starts, corners = take_rows(faces.starts, faces.corners, rows)
+    vertices, place = np.unique(corners, return_inverse=True)
+    least = np.full(len(vertices), math.inf)
+    np.minimum.at(least, place.reshape(-1), np.repeat(size, np.diff(starts)))
+    return vertices, least
+
+
+def _onto(mesh: Faces, sheets: Sheets, vertices: np.ndarray, size: np.ndarray) -> np.ndarray:
+    """Return the points of the surface to which vertices move; those on walls stay on them."""
+    x = mesh.points[vertices]
+    starts, corners = take_rows(mesh.starts, mesh.corners, np.arange(mesh.n_inner, len(mesh)))
+    wall = np.repeat(-1 - mesh.neighbor[mesh.n_inner :], np.diff(starts))
+    pairs = np.unique(np.stack([corners, wall], axis=1), axis=0)
+    place = np.searchsorted(vertices, pairs[:, 0])
+    there = (place < len(vertices)) & (vertices[np.minimum(place, len(vertices) - 1)] == pairs[:, 0])
+    place, wall = place[there], pairs[there, 1]
+    at_wall = np.zeros(len(vertices), bool)
+    at_wall[place] = True
+    corner, edge = sheets.nearest_corner(x, _ON_CORNER * size), sheets.nearest_on_edges(x, _ON_EDGE * size)
+    moved = np.where(np.isfinite(edge), edge, sheets.nearest(x))
+    moved = np.where(np.isfinite(corner) & ~at_wall[:, None], corner, moved)
+    for _ in range(_ROUNDS if len(place) else 0):
+        for w in distinct(wall).tolist():
+            some = place[wall == w]
+            normals, gaps = mesh.domain.toward_walls(np.full(len(some), w), moved[some])
+            moved[some] += gaps[:, None] * normals
+        moved[at_wall] = sheets.nearest(moved[at_wall])
+    if len(place):
+        for w in distinct(wall).tolist():
+            some = place[wall == w]
+            normals, gaps = mesh.domain.toward_walls(np.full(len(some), w), moved[some])
+            moved[some] += gaps[:, None] * normals
+    return moved
