@@ -1022,7 +1022,7 @@ TESTED_IN = {
     "has one side only": "adaptation/test_surfaces.py::test_what_is_refused_at_the_door",
     "surfaces are on the walls": "adaptation/test_surfaces.py::test_surfaces_without_room_are_refused_with_the_place",
     "an edge of a surface inside": "adaptation/test_surfaces.py::test_surfaces_without_room_are_refused_with_the_place",
-    "but the domain has surfaces inside": "adaptation/test_surfaces.py::test_surfaces_without_room_are_refused_with_the_place",
+    "has surfaces inside": "adaptation/test_surfaces.py::test_surfaces_without_room_are_refused_with_the_place",
     "cells meet at a vertex": "tessellation/test_vertices.py::test_walks_around_a_vertex_end",
 }
 """Parts of texts of errors without a row, and the tests that raise them."""

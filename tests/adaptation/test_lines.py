@@ -121,7 +121,7 @@ def test_what_does_not_go_with_lines_is_said(ctx):
     for more, message in (
         ({"method": "transport"}, "has lines"),
         ({"n_cells": 10}, "beside the lines"),
-        ({"fixed": [(0.5, 0.3)]}, "from a line"),
+        ({"fixed": [(0.5, 0.3)]}, "from lines at"),
     ):
         with pytest.raises(InputError, match=message):
             adapter.run(domain, 0.1, "fast", **more)
