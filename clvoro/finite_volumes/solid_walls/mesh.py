@@ -40,7 +40,7 @@ across it, over h."""
 _GOLDEN = (5**0.5 - 1) / 2
 _FEW = 0.03
 """Largest share of generators without a cell; a solid with more of them is refused."""
-_PATIENCE, _ATTEMPTS = 2, 8
+_PATIENCE, _ATTEMPTS = 3, 8
 """How often a mesh is made again without fewer rejected cells than before, and at all."""
 _MOVES, _MOVE = 3, 0.15
 """How often generators of rejected cells are moved, and how far, over h."""
