@@ -255,8 +255,10 @@ class PartSteps(DomainSteps):
 
     def _ask(self, x: np.ndarray, radii: np.ndarray, more: np.ndarray, more_radii: np.ndarray) -> int:
         """Ask for the generators in balls around `x` (n, d) and `more` (k, d); return how many ghosts are new."""
-        balls = [self._near(boxes, x, radii, more, more_radii) for boxes in self._boxes]
-        balls[self.peers.number] = np.empty((0, x.shape[1] + 1))
+        balls = [np.empty((0, x.shape[1] + 1)) for _ in self._boxes]
+        for part, boxes in enumerate(self._boxes):
+            if part != self.peers.number:
+                balls[part] = self._near(boxes, x, radii, more, more_radii)
         wanted = self.peers.exchange(balls)
         found = [self._inside(given, sent) for given, sent in zip(wanted, self._sent, strict=True)]
         self._sent = [np.concatenate(pair) for pair in zip(self._sent, found, strict=True)]
