@@ -560,6 +560,8 @@ class Adapter:
         given = {"effort": effort, "seed": seed, "max_steps": max_steps, "n_cells": n_cells, "layers": layers}
         merged, own = merged_options(points, options, method=method, **given)
         check_run(domain, size, None)
+        if self._peers.shared:
+            raise InputError("start is called with an Adapter that has comm, expected run: ranks share whole runs")
         stages = Stages(self._engine_for(domain))
         with self._at_work(stages):
             shown = self._shown(None, None)

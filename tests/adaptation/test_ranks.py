@@ -11,6 +11,7 @@ import pytest
 
 import clvoro
 from clvoro.errors import InputError, InputTypeError
+from clvoro.opencl.peers import Peers
 from tests.reference.peers import run_parts
 
 ARRAYS = ("points", "volumes", "centroids", "neighbor_starts", "neighbors", "face_measures", "face_centroids")
@@ -87,6 +88,8 @@ def test_a_run_in_parts(ctx, dim, tmp_path):
     alone = clvoro.Adapter(ctx).run(*given, effort="fast")
     meshes, whole = run_in(3, ctx, *given, effort="fast", path=tmp_path / "mesh.pvtu")
     assert whole.check()
+    again = run_in(3, ctx, *given, effort="fast")[1]
+    assert np.array_equal(again.points, whole.points)
     sizes = [len(mesh) for mesh in meshes]
     assert sum(sizes) == len(whole)
     assert max(sizes) < 1.15 * len(whole) / 3
@@ -116,6 +119,11 @@ def test_what_ranks_cannot_share_is_refused(ctx, change):
         run_in(1, ctx, clvoro.Box((0, 0), (1, 1)), 0.2, **change)
     with pytest.raises(InputTypeError, match="communicator"):
         clvoro.Adapter(ctx, comm=4)
+    adapter = clvoro.Adapter(ctx)
+    adapter._peers = Peers()
+    adapter._peers.shared = True
+    with pytest.raises(InputError, match="expected run"):
+        adapter.start(clvoro.Box((0, 0), (1, 1)), 0.2)
 
 
 def test_parts_with_other_input_are_refused(ctx):
