@@ -268,10 +268,12 @@ def read_ugrid(file: Variables) -> MeshInFile | None:
     radius = _radius(file)
     sphere = Sphere(radius)
     name = str(file.about(mesh, "face_node_connectivity"))
-    table = file.integer(name)
+    if name not in file:
+        raise FileError(f"it lacks the variable {name}")
     first = int(np.ravel(file.about(name, "start_index") or 0)[0])
-    fill = file.about(name, "_FillValue")
-    there = table >= first if fill is None else (table != np.ravel(fill)[0])
+    table = file.data(name)  # xarray stores indices as real numbers, with NaN
+    there = table >= first if file.about(name, "_FillValue") is None else ~np.isnan(table)
+    table = np.where(there, table, first).astype(np.int64)
     vertices = sphere.positions(file.real(*nodes))
     counts = there.sum(axis=1)
     corners = _ragged(table, counts, len(vertices), first, name)

@@ -87,7 +87,7 @@ def curvature_of(values: object, on: Result | Diagram, p: float, weight: ArrayLi
     fields, found = _fields(values, len(stencils)), []
     for field in fields:
         spectral = np.abs(np.linalg.eigvalsh(derivatives(field, stencils.mesh)[1])).max(axis=-1)
-        spectral = np.sqrt((spectral.reshape(len(field), -1) ** 2).sum(axis=1))
+        spectral = _lengths(spectral.reshape(len(field), -1))
         # After the absolute value: before it both sides of a layer would cancel.
         found.append(_free_of_rounding(stencils.smooth(spectral, _SMOOTHED), field, stencils, 2))
     if len(fields) > 1:
@@ -121,7 +121,7 @@ def steepness(values: ArrayLike | Sequence[ArrayLike], on: Result | Diagram) -> 
     found = []
     for field in _fields(values, len(stencils)):
         gradients = derivatives(field, stencils.mesh)[0]
-        steep = np.sqrt((gradients.reshape(len(field), -1) ** 2).sum(axis=1))
+        steep = _lengths(gradients.reshape(len(field), -1))
         found.append(_free_of_rounding(steep, field, stencils, 1))
     if len(found) > 1:
         found = [_scaled(steep, stencils.mesh.volumes, 1.0) for steep in found]
@@ -185,6 +185,12 @@ def _not_negative(what: str, values: object, n: int) -> np.ndarray:
             "the absolute value, or numpy.maximum(values, 0)"
         )
     return array
+
+
+def _lengths(rows: np.ndarray) -> np.ndarray:
+    """Return the lengths of `rows` (n, k), which may be so large or so small that their squares are not finite or 0."""
+    unit = np.ldexp(1.0, np.frexp(np.abs(rows).max(initial=0.0))[1])
+    return unit * np.sqrt(((rows / unit) ** 2).sum(axis=1))
 
 
 def _free_of_rounding(found: np.ndarray, field: np.ndarray, stencils: CellStencils, order: int) -> np.ndarray:

@@ -100,6 +100,18 @@ def changed(path, convention, change):
     return path / "bad.nc"
 
 
+def test_indices_as_real_numbers(tmp_path):
+    """As xarray writes them."""
+
+    def change(values, attributes):
+        nodes, dims, about = values["mesh_face_nodes"]
+        nodes = np.where(nodes == about["_FillValue"], np.nan, nodes)
+        values["mesh_face_nodes"] = nodes, dims, {**about, "_FillValue": np.nan}
+
+    mesh = clvoro.load(changed(tmp_path, "ugrid", change))
+    assert np.array_equal(mesh.neighbors, clvoro.load(tmp_path / "good.nc").neighbors)
+
+
 def put(name, at, value):
     def change(values, attributes):
         values[name][0][at] = value

@@ -206,6 +206,10 @@ def test_fields_of_other_units_count_alike(fine):
     assert vector([(0.52, 0.1)]) > 2 * vector([(0.1, 0.52)])
     weighted = sizing.hessian_size(u, on=fine, n_cells=2000, weight=(y < 0.5).astype(float))
     assert weighted([(0.52, 0.9)]) > 2 * weighted([(0.52, 0.1)])
+    both, large = (sizing.hessian_size(u[:, None] * [1, 2] * f, on=fine, n_cells=800) for f in (1, 1e290))
+    assert large.values == pytest.approx(both.values, rel=1e-9)
+    small = sizing.gradient_size(u * 1e-290, on=fine, n_cells=800)
+    assert small.values == pytest.approx(sizing.gradient_size(u, on=fine, n_cells=800).values, rel=1e-9)
 
 
 def test_weights_of_goals(fine):
