@@ -75,7 +75,7 @@ def check_shared(domain: Domain, options: Options, fixed: object, checkpoint: ob
     """Raise if ranks cannot share such a run."""
     what = ""
     if not domain.may_have_parts:
-        what = f"domain is {domain!r:.80}, expected a Box with walls and without lines"
+        what = f"domain is {domain!r:.80}, expected a Box with walls, without lines or surfaces inside"
     elif options.method in ("transport", *MOVING):
         what = f"method is {options.method!r}, expected 'adaptive', or one that repeats a kind of step"
     elif options.layers or fixed is not None or checkpoint is not None:
