@@ -18,7 +18,6 @@ def rectangle(low, high, z=0.5, rise=0.0):
 
 CASES = {
     "cube": (BOX, {"heater": CUBE}, "float64", {"heater": CUBE.measure}, 1e-9),
-    "float32": (BOX, {"heater": CUBE}, "float32", {"heater": CUBE.measure}, 1e-5),
     "touching": (
         BOX,
         {"left": Solid.box((0.2, 0.3, 0.3), (0.5, 0.7, 0.7)), "right": Solid.box((0.5, 0.3, 0.3), (0.8, 0.7, 0.7))},
@@ -26,8 +25,7 @@ CASES = {
         {"left": 0.048, "right": 0.048},
         1e-9,
     ),
-    "plate": (BOX, rectangle(-0.2, 1.2), "float64", {"region-0": 0.5, "region-1": 0.5}, 1e-9),
-    "oblique": (BOX, rectangle(-0.2, 1.2, rise=0.3), "float64", {"region-0": 0.5, "region-1": 0.5}, 1e-9),
+    "oblique": (BOX, rectangle(-0.2, 1.2, rise=0.3), "float32", {"region-0": 0.5, "region-1": 0.5}, 1e-5),
     "at a wall": (BOX, {"slab": Solid.box((0, 0, 0), (0.3, 1, 1))}, "float64", {"slab": 0.3}, 1e-9),
     "ball": (BOX, {"ball": Solid.ball((0.5, 0.5, 0.5), 0.3)}, "float64", {"ball": 4 / 3 * np.pi * 0.027}, 0.06),
     "solid": (

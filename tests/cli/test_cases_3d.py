@@ -113,6 +113,20 @@ def test_printed_case_runs_elsewhere(here, capsys):
     assert "is open: 3 edges" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("surfaces", "names", "extent"),
+    [("'part.off'", ("surface-1",), 1.0), ("[{ file = 'part.off', name = 'core', units = 'cm' }]", ("core",), 0.01)],
+)
+def test_surfaces_inside_are_in_case_files(here, surfaces, names, extent):
+    (here / "part.off").write_text(off(CORNERS, TRIANGLES))
+    (here / "mine.toml").write_text(
+        f"size = 0.3\n[domain]\nlower = [-1, -1, -1]\nupper = [1, 1, 1]\nsurfaces = {surfaces}"
+    )
+    borders = load_case("mine.toml").domain.borders
+    assert borders.names == names
+    assert np.ptp(borders.surface.vertices, axis=0) == pytest.approx([extent] * 3)
+
+
 # Bad input.
 
 
