@@ -281,7 +281,7 @@ def picture(found: list[tuple[str, clvoro.Result]], path: Path) -> None:
             plot_cells(mesh, "size", ax, key=False)
             ax.set_title(f"{name}: {len(mesh):,} cells", loc="left", fontsize=9)
             ax.set(xticks=[], yticks=[], xlabel="", ylabel="")
-        figure.savefig(path, dpi=150)
+        figure.savefig(path, dpi=90)
 
 
 COLUMNS = {

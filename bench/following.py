@@ -213,7 +213,7 @@ def main(arguments: list[str] | None = None) -> int:
         record, (mesh, u) = followed(adapter, n, options.cycles, options.steps, options.width)
         report.add(record, f"followed, {n}")
         if options.picture:
-            mesh.plot(u, label="u").savefig(options.picture, dpi=150)
+            mesh.plot(u, label="u").savefig(options.picture, dpi=90)
     for n in options.uniform:
         report.add(uniform(adapter, n, options.width), f"uniform, {n}")
     report.finish(heading(adapter, f"A disk that turns once, {options.cycles} meshes"))
