@@ -49,6 +49,7 @@ from solver_ready import COLUMNS as PLANE_COLUMNS
 from solver_ready import figures_of
 
 import clvoro
+from clvoro.adaptation.options import EFFORTS
 from clvoro.errors import ClvoroError
 from clvoro.io.check_mesh import check_case
 
@@ -276,7 +277,7 @@ DOMAINS: dict[str, Callable[[], Any]] = {
     "body": lambda: clvoro.Solid.outside(wavy_body(), CUBE),
 }
 """Domains of which speeds are compared."""
-RUNS = ("fast", "default", "best", "exact")
+RUNS = (*EFFORTS, "exact")
 
 
 def measure_speed(adapter: clvoro.Adapter, n: int, chosen: list[str], report: Report) -> None:
