@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 from weakref import WeakKeyDictionary
@@ -22,6 +23,9 @@ SAGITTA, SAGITTA_SLOPE = 0.245, 0.7
 """Depth of wall polygons, whose vertices lie on the surface, below a surface of mean curvature H, over H h^2: half the
 mean square of the vertices' distance from the foot, which is 0.19 of the area of hexagons. Wall faces are larger than
 h^2, and the more so the more convex the wall is: the factor is 1 + SAGITTA_SLOPE H h. Measured in and around balls."""
+TIP_COSINE, TIP_STEPS, TIP_BEND = math.cos(math.radians(30)), 6, 0.4
+"""A patch has a tip, as that of a cone, where the cosine between its mean normal and that of a triangle is less. The
+long triangles there are halved so often towards the tip, and mean curvature times h counts as at most TIP_BEND."""
 SIDE_PER_ROOT, LEAST_SIDE, LARGEST_SIDE = 0.4, 48, 128
 """Bins along the longest side, per square root of the number of triangles, and limits: bins are as wide as triangles,
 so that few triangles are in several of them."""
@@ -56,13 +60,20 @@ class WallTriangles:
     def __init__(
         self, corners: np.ndarray, patch: np.ndarray, normals: np.ndarray, edges: np.ndarray, ends: np.ndarray
     ) -> None:
+        corners = np.asarray(corners, float)
         sides = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        kept = np.flatnonzero(np.linalg.norm(sides, axis=1) > 0)
-        kept = kept[curve_order(np.asarray(corners, float)[kept].mean(axis=1))]
-        self.items = kept = kept[np.argsort(np.asarray(patch)[kept], kind="stable")]
-        self.corners, self.patch = np.asarray(corners, float)[kept], np.asarray(patch)[kept]
-        self.normals = np.asarray(normals, float)[kept]
-        self.edges, self.ends = np.asarray(edges)[kept], np.asarray(ends)[kept]
+        items = np.flatnonzero(np.linalg.norm(sides, axis=1) > 0)
+        source, corners, normals, edges, ends, *tips = _divided_at_tips(
+            *(np.asarray(array)[items] for array in (corners, normals, edges, ends))
+        )
+        items = items[source]
+        kept = curve_order(corners.mean(axis=1))
+        kept = kept[np.argsort(np.asarray(patch)[items[kept]], kind="stable")]
+        self.items = items[kept]
+        self.corners, self.normals = corners[kept], normals[kept]
+        self.patch: np.ndarray = np.asarray(patch)[self.items]
+        self.edges, self.ends = edges[kept], ends[kept]
+        self._tips = tuple(values[kept] for values in tips)
         self._known: WeakKeyDictionary[Workspace, dict[object, tuple[object, ...]]] = WeakKeyDictionary()
 
     def __len__(self) -> int:
@@ -90,11 +101,15 @@ class WallTriangles:
             Size h of cells at points (k, 3), (k,); without it nothing is moved.
         """
         shift = np.zeros(self.edges.shape)
+        tip, share, away = self._tips
         if size is not None:
             h = np.asarray(size(self.corners.reshape(-1, 3)), float).reshape(shift.shape)
             bend = mean_curvature(self.corners, self.normals)[:, None] * h
+            bend = np.where((share < 1).any(axis=1, keepdims=True), np.clip(bend, -TIP_BEND, TIP_BEND), bend)
             shift = SAGITTA * bend * np.clip(1 + SAGITTA_SLOPE * bend, 0.5, 1.5) * h / scale
-        return np.concatenate([self.normals, shift[..., None]], axis=2)
+            share = np.clip(away / h, share, 1)
+        normals = np.where(share[..., None] < 1, tip + share[..., None] * (self.normals - tip), self.normals)
+        return np.concatenate([normals, shift[..., None]], axis=2)
 
     def arguments(self, engine: Engine, frame: tuple[np.ndarray, float]) -> tuple[object, ...]:
         """Return WALL_ARGS in the coordinates ``(x - origin) / scale`` of `frame`; see geometry/walls.h."""
@@ -134,6 +149,63 @@ class WallTriangles:
                 engine.upload(self.planes(frame)),
             )
         return there[name]
+
+
+def _divided_at_tips(
+    corners: np.ndarray, normals: np.ndarray, edges: np.ndarray, ends: np.ndarray
+) -> tuple[np.ndarray, ...]:
+    """Divide triangles at tips, so that normals can turn to that of the tip within h of it, not over whole triangles.
+
+    Each is halved `TIP_STEPS` times towards the tip. Both triangles at a side are divided at the same points.
+
+    Returns
+    -------
+    source : (m,) int
+        The triangle that each one is a part of.
+    corners, normals, edges, ends : (m, 3, 3), (m, 3, 3), (m, 3), (m, 3)
+        As for `WallTriangles`. Normals at new points are those at the end of their side.
+    tip : (m, 3, 3) float
+        At new points the normal of the tip, elsewhere 0.
+    share : (m, 3) float
+        How far new points are along their side from the tip, over its length; elsewhere 1.
+    away : (m, 3) float
+        Distance of new points from the tip; elsewhere 0.
+    """
+    own = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    own /= np.linalg.norm(own, axis=1)[:, None]
+    steep = np.einsum("tkd,td->tk", normals, own) < TIP_COSINE
+    chosen = np.flatnonzero(steep.sum(axis=1) == 1)
+    whole = np.setdiff1d(np.arange(len(corners)), chosen)
+    # The tip comes first.
+    turn = (steep[chosen].argmax(axis=1)[:, None] + np.arange(3)) % 3
+    x, n = corners[chosen[:, None], turn], normals[chosen[:, None], turn]
+    side, end = edges[chosen[:, None], turn], ends[chosen[:, None], turn]
+    m, zero, steps = len(chosen), np.zeros(len(chosen), edges.dtype), 0.5 ** np.arange(TIP_STEPS + 1)
+    point = x[:, :1, None] + steps[:, None] * (x[:, 1:, None] - x[:, :1, None])  # (m, 2, steps + 1, 3)
+    length = np.linalg.norm(x[:, 1:] - x[:, :1], axis=2)
+    last, one = TIP_STEPS, np.ones(m)
+    # Corners of the parts: the tip as (-1, 0), others as a side and a step; kinds of sides.
+    parts = [(((-1, 0), (0, last), (1, last)), (side[:, 0], zero, side[:, 2]))]
+    for k in range(last):
+        parts.append((((0, k + 1), (0, k), (1, k)), (side[:, 0], zero if k else side[:, 1], zero)))
+        parts.append((((0, k + 1), (1, k), (1, k + 1)), (zero, side[:, 2], zero)))
+    made: list[list[np.ndarray]] = [[corners[whole]], [normals[whole]], [edges[whole]], [ends[whole]]]
+    made += [[np.zeros((len(whole), 3, 3))], [np.ones((len(whole), 3))], [np.zeros((len(whole), 3))]]
+    for places, kinds in parts:
+        is_new = [s >= 0 and k > 0 for s, k in places]
+        of_part = (
+            [x[:, 0] if s < 0 else point[:, s, k] for s, k in places],
+            [n[:, s + 1] for s, _ in places],
+            kinds,
+            [side[:, 2 * s] if new else end[:, s + 1] for (s, _), new in zip(places, is_new, strict=True)],
+            [n[:, 0] * new for new in is_new],
+            [one * (steps[k] if new else 1) for (_, k), new in zip(places, is_new, strict=True)],
+            [length[:, s] * steps[k] * new for (s, k), new in zip(places, is_new, strict=True)],
+        )
+        for values, of_corners in zip(made, of_part, strict=True):
+            values.append(np.stack(of_corners, axis=1))
+    source = np.concatenate([whole, np.tile(chosen, len(parts))])
+    return source, *(np.concatenate(values) for values in made)
 
 
 def mean_curvature(corners: np.ndarray, normals: np.ndarray) -> np.ndarray:

@@ -187,3 +187,28 @@ def test_parts_without_cells():
         assert measures == pytest.approx(volume, rel=share)
         assert np.abs(found - np.array(places).reshape(-1, 3)).max(initial=0) < 0.35
         assert (solid.covers(found) == (measures > 0)).all()
+
+
+def test_long_triangles_have_the_normal_of_a_tip_only_within_h_of_it():
+    turn = 2 * np.pi * np.arange(48) / 48
+    rim = np.column_stack([np.cos(turn), np.sin(turn), np.zeros(48)])
+    k, after = np.arange(48), (np.arange(48) + 1) % 48
+    side = np.column_stack([np.full(48, 48), k, after])
+    base = np.column_stack([np.full(48, 49), after, k])
+    cone = Solid(np.vstack([rim, [(0, 0, 2), (0, 0, 0)]]), np.concatenate([side, base]))
+    walls, h = cone.wall_triangles, 0.2
+    sides = np.cross(walls.corners[:, 1] - walls.corners[:, 0], walls.corners[:, 2] - walls.corners[:, 0])
+    areas = np.linalg.norm(sides, axis=1) / 2
+    assert np.bincount(walls.items, areas) == pytest.approx(cone._areas)
+    assert np.einsum("ti,ti->t", sides / areas[:, None], cone.normals[walls.items]) == pytest.approx(2)
+    x, normals = walls.corners.reshape(-1, 3), walls.corner_normals(1.0, lambda x: np.full(len(x), h))
+    normals = normals[..., :3].reshape(-1, 3)
+    on_side = cone.normals[np.repeat(walls.items, 3), 2] > 0
+    away = np.linalg.norm(x - (0, 0, 2), axis=1)
+    assert normals[on_side & (away == 0)] == pytest.approx(np.tile((0.0, 0.0, 1.0), (48, 1)), abs=1e-9)
+    far = on_side & (away >= h)
+    exact = np.column_stack([2 * x[far, :2] / np.linalg.norm(x[far, :2], axis=1)[:, None], np.ones(far.sum())])
+    assert normals[far] == pytest.approx(exact / np.sqrt(5), abs=0.01)
+    near = on_side & (away > 0) & (away < h)
+    assert near.any()
+    assert (normals[near, 2] > 1 / np.sqrt(5) + 0.01).all()
