@@ -13,6 +13,8 @@ from ..mesh.lookup import cell_shapes
 
 _STRAIGHT = 1e-9
 """A corner that points inwards counts as straight if its edges span no more than this share of the cell's area."""
+_THIN = 1e-12
+"""A triangle with less than this share of the cell's area is left out."""
 _FLAT = 1e-6
 """A face counts as plane if no corner is farther from its plane than this share of the cell's width."""
 _ON_WALL = 1e-3
@@ -86,6 +88,10 @@ def _between_corners(diagram: Diagram) -> Pieces:
         parts = shapely.constrained_delaunay_triangles(cell_shapes(diagram, bent))
         triangles, of = shapely.get_parts(parts, return_index=True)
         corners = shapely.get_coordinates(shapely.orient_polygons(triangles)).reshape(-1, 4, 2)[:, :3]
+        a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+        # The lines through the sides of a thinner one bound nothing.
+        thick = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0] > _THIN * diagram.volumes[bent[of]]
+        corners, of = corners[thick], of[thick]
         items = np.concatenate([items, len(x) + np.arange(3 * len(corners))])
         starts = np.concatenate([starts, starts[-1] + 3 * np.arange(1, len(corners) + 1)])
         cells, x = np.concatenate([cells, bent[of]]), np.concatenate([x, corners.reshape(-1, 2)])

@@ -136,6 +136,22 @@ def test_parts_of_a_polygon():
     assert old.transfer(np.full(len(old), 3.0), new) == pytest.approx(3)
 
 
+def test_pieces_at_a_sharp_tail():
+    """A face that meets the tail but for round-off makes a triangle without an area."""
+    corners = [(-9.5, -10), (10.5, -10), (10.5, 10), (-9.5, 10)]
+    domain = clvoro.Polygon(corners, [clvoro.curves.naca("0012")])
+    old = [
+        (1.0705332228555686, -0.06563809236423206),
+        (0.9395958919237616, 0.07506422865202093),
+        (0.939595891923761, -0.07506422865202052),
+        (0.8006209515312168, -0.09254249967492711),
+        (0.8908827656226865, -0.2063764464238993),
+        (0.870948168644345, 0.2085332592330147),
+    ]
+    new = clvoro.voronoi(domain, [(0.9685904877271423, -0.039032623544783186)])
+    assert clvoro.voronoi(domain, old).transfer(np.ones(6), new) == pytest.approx(1)
+
+
 @pytest.mark.parametrize("shape", ["ball", "bracket"])
 def test_cells_of_solids_are_those_of_the_mesh(ctx, shape):
     """Their faces at walls and creases are not on bisectors. In a box around them nothing of them is lost."""
