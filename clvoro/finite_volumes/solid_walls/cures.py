@@ -40,8 +40,9 @@ _SLIVER, _TIP, _FEW = 0.05, 0.4, 4
 others. So may up to `_FEW` cells without faces to others."""
 _TOO_MANY = 0.2
 """Where more than this share of the cells are rejected, the solid is as thin as a cell, and no cure is tried."""
-_BUDGET, _MOST = 12, 400
-"""Most changes of a rejected cell before others have their turn, and most searches for cures of a mesh."""
+_BUDGET, _MOST = 12, 600
+"""Most changes of a rejected cell before others have their turn, and most searches for cures in attempts that follow
+one another."""
 _AHEAD = 1
 """Where no cure of a cell helps, cures of the cells that OpenFOAM rejects after it may follow: how many in turn."""
 _BRANCHES, _MOST_BAD = 2, 3
@@ -72,7 +73,7 @@ class Cures:
     edits : Edits
         The mesh with all changes that are kept.
     searches : int
-        How often cures have been tried on a cell.
+        How often cures have been tried on a cell, also by the earlier cures.
     """
 
     def __init__(
@@ -90,13 +91,18 @@ class Cures:
         old = earlier.edits
         matches = Matches(old, earlier.names, self.edits, self.names)
         cells = self.edits.repeat(old, matches)
-        self.changes = earlier.changes
+        self.changes, self.searches = earlier.changes, earlier.searches
         self.changed = {cells[c]: when for c, when in earlier.changed.items() if c in cells}
         changed = old.touched
         for c, when in earlier.tried.items():
             around = {c, *old.neighbors(c)}
             if when == earlier.stamp(c) and all(n in cells or (n not in changed and matches.find(n)) for n in around):
                 self.tried[cells[c] if c in cells else matches.cells[c]] = when
+
+    @property
+    def are_spent(self) -> bool:
+        """Return whether no more searches are made."""
+        return self.searches >= _MOST
 
     def h(self, edits: Edits, cell: int) -> float:
         """Return the size of a cell."""
@@ -105,7 +111,7 @@ class Cures:
     def cure(self, cell: int) -> bool:
         """Make the best change to the mesh around a cell if it is rejected; return whether one helps."""
         edits = self.edits
-        if not edits.faces_of(cell) or self.tried.get(cell) == self.stamp(cell) or self.searches >= _MOST:
+        if not edits.faces_of(cell) or self.tried.get(cell) == self.stamp(cell) or self.are_spent:
             return False
         self.measure([cell])
         if self.excess[cell][1] == 0:

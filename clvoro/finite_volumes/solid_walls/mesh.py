@@ -167,10 +167,10 @@ def solid_diagram(
         If generators have no cell, cells are cut, leave out creases, or are concave: how many, and the first place.
     """
     near = NearWalls.of(surface, points, sizes, whole(points))
-    best = _Attempts(surface, near, np.full(len(near.sizes), EXACT, np.int8), None, tell)
+    best = made = _Attempts(surface, near, np.full(len(near.sizes), EXACT, np.int8), None, tell)
     for move in range(_MOVES):
         rows = np.setdiff1d(near.numbers[best.made.home[best.made.rejected]], [-1])
-        if not 0 < len(rows) <= _FEW * len(points):
+        if not 0 < len(rows) <= _FEW * len(points) or made.are_spent:
             break
         moved = _moved(surface, near.points, sizes, rows, move)
         other = NearWalls.of(surface, moved, sizes, whole(moved))
@@ -183,10 +183,10 @@ def solid_diagram(
             break
         if len(made.made.rejected) < len(best.made.rejected):
             best, near = made, other
-    made, points = best.made, near.points
-    rejected = made.faces.generators[made.rejected]
+    mesh, points = best.made, near.points
+    rejected = mesh.faces.generators[mesh.rejected]
     tell("cells without walls")
-    faces, home = near.put_back(made.faces, made.home, made.own)
+    faces, home = near.put_back(mesh.faces, mesh.home, mesh.own)
     lost = np.setdiff1d(np.arange(len(points)), home)
     for rows, text in (
         (points[lost], "generators at {} have no cell: the solid is thinner than a cell, which is left out"),
@@ -237,6 +237,8 @@ class _Attempts:
         The mesh.
     walls : (p + 1,) int8
         How its walls are made.
+    are_spent : bool
+        Whether there were so many rejected cells that no more are cured.
 
     Raises
     ------
@@ -273,7 +275,8 @@ class _Attempts:
                 best, self.walls, since = made, walls.copy(), 0
             elif (surface.nearest_crease(places, 3 * near.sizes[made.home[made.rejected]])[0] < 0).all():
                 break  # without creases there the next attempts are the same
-            if not len(made.rejected):
+            self.are_spent = cures is not None and cures.are_spent
+            if not len(made.rejected) or self.are_spent:
                 break
             _simplify(walls, near, np.unique(made.home[made.rejected]))
         assert best is not None
