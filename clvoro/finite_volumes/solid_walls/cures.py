@@ -40,7 +40,7 @@ _SLIVER, _TIP, _FEW = 0.05, 0.4, 4
 others. So may up to `_FEW` cells without faces to others."""
 _TOO_MANY = 0.2
 """Where more than this share of the cells are rejected, the solid is as thin as a cell, and no cure is tried."""
-_BUDGET, _MOST = 12, 600
+_BUDGET, _MOST = 12, 1000
 """Most changes of a rejected cell before others have their turn, and most searches for cures in attempts that follow
 one another."""
 _AHEAD = 1
