@@ -24,7 +24,7 @@ _FLAT = 1e-6
 """Vertices this near to a surface, over h, are on it."""
 _NARROW, _TINY = 0.08, 1e-3
 """Faces between cells at surfaces that are collapsed, over h^2, if a cell is concave there; and in any case."""
-_COLLAPSES = 3
+_COLLAPSES, _TRIALS = 3, 20
 _ROUNDS = 4
 """How often vertices at walls are moved to the surface, and back to the walls."""
 
@@ -54,7 +54,27 @@ def on_surfaces(diagram: Diagram, sheets: Sheets) -> Diagram:
         if not narrow.any():
             break
         made = _moved(collapse_short(made.faces, made, narrow, narrow), sheets, h)
+    # One by one, whatever faces around become, if fewer cells are concave.
+    concave, tried = np.count_nonzero(made.faces.measures.concave), 0
+    while concave and tried < _TRIALS:
+        narrow = np.flatnonzero(_narrow_faces(made, h))[tried:]
+        if not len(narrow):
+            break
+        trial = _moved(_without_face(made.faces, narrow[0]), sheets, h)
+        left = np.count_nonzero(trial.faces.measures.concave)
+        if left < concave:
+            made, concave = trial, left
+        else:
+            tried += 1
     return made
+
+
+def _without_face(mesh: Faces, row: int) -> Faces:
+    """Return a mesh in which all corners of a face are one vertex, in the middle."""
+    corners = mesh.corners[mesh.starts[row] : mesh.starts[row + 1]]
+    points, to = mesh.points.copy(), np.arange(len(mesh.points))
+    points[corners[0]], to[corners] = points[corners].mean(axis=0), corners[0]
+    return _relabeled(replace(mesh, points=points), to)
 
 
 def _moved(mesh: Faces, sheets: Sheets, h: np.ndarray) -> Diagram:
@@ -67,10 +87,16 @@ def _moved(mesh: Faces, sheets: Sheets, h: np.ndarray) -> Diagram:
 
 
 def _narrow_faces(diagram: Diagram, h: np.ndarray) -> np.ndarray:
-    """Return the small faces with which cells at surfaces are concave, and those nearly without an area, (f,) bool."""
+    """Return the small faces with which cells at surfaces or beside these are concave, and those with the least area.
+
+    (f,) bool.
+    """
     mesh, rows = diagram.faces, diagram.border_faces
     beside = np.zeros(mesh.n_cells, bool)
     beside[mesh.owner[rows]] = beside[mesh.neighbor[rows]] = True
+    one, other = mesh.owner[: mesh.n_inner], mesh.neighbor[: mesh.n_inner]
+    ring = np.concatenate([one[beside[other]], other[beside[one]]])  # these have vertices on surfaces, too
+    beside[ring] = True
     size = np.minimum(h[mesh.owner], h[np.maximum(mesh.neighbor, 0)]) ** 2
     chosen = np.zeros(len(mesh), bool)
     chosen[mesh.measures.concave_pairs(DefectLimits().concavity, beside)[0]] = True
