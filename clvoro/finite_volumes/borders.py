@@ -14,6 +14,7 @@ from ..mesh.diagram import Diagram
 from ..mesh.faces import Faces
 from .collapse import collapse_short
 from .defects import DefectLimits
+from .gate import rejected_cells
 from .solid_walls.mesh import diagram_of
 
 _SMALL = 0.15
@@ -54,19 +55,30 @@ def on_surfaces(diagram: Diagram, sheets: Sheets) -> Diagram:
         if not narrow.any():
             break
         made = _moved(collapse_short(made.faces, made, narrow, narrow), sheets, h)
-    # One by one, whatever faces around become, if fewer cells are concave.
-    concave, tried = np.count_nonzero(made.faces.measures.concave), 0
-    while concave and tried < _TRIALS:
-        narrow = np.flatnonzero(_narrow_faces(made, h))[tried:]
+    # One by one, whatever faces around become, if fewer cells are rejected.
+    rejected, tried = _rejected(made), 0
+    while len(rejected) and tried < _TRIALS:
+        mesh = made.faces
+        of_rejected = np.isin(mesh.owner, rejected) | np.isin(mesh.neighbor, rejected)
+        size = np.minimum(h[mesh.owner], h[np.maximum(mesh.neighbor, 0)]) ** 2
+        narrow = np.flatnonzero((of_rejected & (mesh.area < _NARROW * size))[: mesh.n_inner])
+        narrow = narrow[np.argsort((mesh.area / size)[narrow], kind="stable")][tried:]
         if not len(narrow):
             break
-        trial = _moved(_without_face(made.faces, narrow[0]), sheets, h)
-        left = np.count_nonzero(trial.faces.measures.concave)
-        if left < concave:
-            made, concave = trial, left
+        trial = _moved(_without_face(mesh, narrow[0]), sheets, h)
+        left = _rejected(trial)
+        if len(left) < len(rejected):
+            made, rejected, tried = trial, left, 0
         else:
             tried += 1
     return made
+
+
+def _rejected(diagram: Diagram) -> np.ndarray:
+    """Return the cells at surfaces, or beside these, that OpenFOAM rejects, (k,) int."""
+    mesh, beside = diagram.faces, _beside(diagram)
+    divided = beside[mesh.owner] | (beside[np.maximum(mesh.neighbor, 0)] & (mesh.neighbor >= 0))
+    return np.flatnonzero(rejected_cells(mesh, np.flatnonzero(divided), beside))
 
 
 def _without_face(mesh: Faces, row: int) -> Faces:
@@ -86,17 +98,23 @@ def _moved(mesh: Faces, sheets: Sheets, h: np.ndarray) -> Diagram:
     return diagram_of(replace(mesh, points=points, diagram=None))
 
 
+def _beside(diagram: Diagram) -> np.ndarray:
+    """Return which cells have vertices on surfaces: those at surfaces, and those beside these; (n,) bool."""
+    mesh, rows = diagram.faces, diagram.border_faces
+    beside = np.zeros(mesh.n_cells, bool)
+    beside[mesh.owner[rows]] = beside[mesh.neighbor[rows]] = True
+    one, other = mesh.owner[: mesh.n_inner], mesh.neighbor[: mesh.n_inner]
+    ring = np.concatenate([one[beside[other]], other[beside[one]]])
+    beside[ring] = True
+    return beside
+
+
 def _narrow_faces(diagram: Diagram, h: np.ndarray) -> np.ndarray:
     """Return the small faces with which cells at surfaces or beside these are concave, and those with the least area.
 
     (f,) bool.
     """
-    mesh, rows = diagram.faces, diagram.border_faces
-    beside = np.zeros(mesh.n_cells, bool)
-    beside[mesh.owner[rows]] = beside[mesh.neighbor[rows]] = True
-    one, other = mesh.owner[: mesh.n_inner], mesh.neighbor[: mesh.n_inner]
-    ring = np.concatenate([one[beside[other]], other[beside[one]]])  # these have vertices on surfaces, too
-    beside[ring] = True
+    mesh, beside = diagram.faces, _beside(diagram)
     size = np.minimum(h[mesh.owner], h[np.maximum(mesh.neighbor, 0)]) ** 2
     chosen = np.zeros(len(mesh), bool)
     chosen[mesh.measures.concave_pairs(DefectLimits().concavity, beside)[0]] = True

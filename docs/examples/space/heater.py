@@ -15,7 +15,7 @@ import clvoro
 heater = clvoro.Solid.box((0.15, 0.2, 0.1), (0.5, 0.8, 0.35))
 duct = clvoro.Solid.cylinder((0.75, -0.2, 0.65), (0.75, 1.2, 0.65), 0.15)
 room = clvoro.Box((0, 0, 0), (1, 1, 1)).with_surfaces({"heater": heater, "duct": duct})
-mesh = clvoro.adapt(room, clvoro.sizing.Distance(room.borders.surface, 0.05, growth=1.15, h_max=0.1), effort="fast")
+mesh = clvoro.adapt(room, clvoro.sizing.Distance(room.borders.surface, 0.045, growth=1.15, h_max=0.1), effort="fast")
 d = mesh.diagram
 volumes = np.bincount(d.cell_region, d.volumes)
 print({name: round(float(v), 4) for name, v in zip(d.region_names, volumes, strict=True)}, "heater:", heater.measure)
