@@ -12,7 +12,7 @@ import numpy as np
 import clvoro
 from clvoro import sizing
 
-N, PARTS, PART = 2000, 5, 2 * 3600.0
+N, PARTS, PART = 2000, 3, 2 * 3600.0
 GRAVITY, ROTATION, DEPTH = 9.80616, 7.292e-5, 4000.0
 globe = clvoro.Sphere(6.37122e6)
 
@@ -99,14 +99,14 @@ for _ in range(PARTS):
 print(f"volume of water off by {mesh.volumes @ state[:, 0] / total - 1:.0e}")
 
 # %%
-# After four hours.
+# After two hours.
 
-early, height = frames[1]
+early, height = frames[0]
 early.plot(height, label="height [m]", center=(0, 30), title=f"{len(early):,} cells")
 plt.show()
 
 # %%
-# After ten hours.
+# After six hours.
 
-mesh.plot(frames[-1][1], label="height [m]", center=(60, 60), title=f"{len(mesh):,} cells")
+mesh.plot(frames[-1][1], label="height [m]", center=(40, 40), title=f"{len(mesh):,} cells")
 plt.show()
