@@ -106,7 +106,7 @@ def test_refinement_gives_the_number_of_the_next_level(adapter):
 def test_cells_are_coupled_again_after_a_change_of_their_number(rows, n, steps, changed):
     kind = [("level", int), ("cells", int)]
     rows = [np.array([row], kind) for row in rows]
-    run = SimpleNamespace(rows=rows, level=0, state=SimpleNamespace(n=n))
+    run = SimpleNamespace(rows=rows, level=0, state=SimpleNamespace(total=n))
     assert count_changed(run, steps) == changed
 
 
