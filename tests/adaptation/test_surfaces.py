@@ -108,8 +108,8 @@ def test_generators_beside_surfaces_are_mirror_images_and_nearest_to_them(mesh):
 
 
 def test_segments_cross_surfaces_as_often_as_they_change_sides():
-    sheets = BOX.with_surfaces(Solid.torus((0.5, 0.5, 0.5), 0.3, 0.1)).borders.sheets
-    torus = Solid.torus((0.5, 0.5, 0.5), 0.3, 0.1)
+    torus = Solid.torus((0.5, 0.5, 0.5), 0.3, 0.1, edge=0.05)
+    sheets = BOX.with_surfaces(torus).borders.sheets
     a, b = np.random.default_rng(3).uniform(0, 1, (2, 500, 3))
     assert np.array_equal(sheets.crossed(a, b) % 2 == 1, torus.contains(a) != torus.contains(b))
     plate = BOX.with_surfaces(rectangle(0, 1)).borders.sheets
