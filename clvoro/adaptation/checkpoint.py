@@ -99,6 +99,7 @@ class Checkpointer:
             "level": run.level,
             "levels": run.levels,
             "near": run.near,
+            "path": run.drawn_because,
             "n_start": run.n_start,
             "started": run.started,
             "steps": run.steps,
@@ -126,6 +127,8 @@ class Saved:
         Number of coarser levels of the run.
     near : bool
         Whether the run only corrects a given mesh.
+    path : str
+        Why the run does not begin with the given points; empty if it does.
 
     Raises
     ------
@@ -152,7 +155,7 @@ class Saved:
                 raise ValueError("counts")
             self.size_factor = float.fromhex(state["size_factor"])
             self.elapsed = float(state["elapsed"])
-            self.levels, self.near = int(state["levels"]), bool(state["near"])
+            self.levels, self.near, self.path = int(state["levels"]), bool(state["near"]), str(state["path"])
             if not (0 < self.size_factor < np.inf and 0 <= self.elapsed < np.inf and state["level"] <= self.levels):
                 raise ValueError("size_factor")
             self._check(len(self.fingerprint["domain"]["lower"]), np.dtype(self.fingerprint["dtype"]))

@@ -39,7 +39,17 @@ from .sampling.quadrature import DensityTree
 from .sampling.start import charted, density_tree, sample_density, sample_uniform
 from .stages import Stages
 from .state import MeshState, Setup
-from .tuning import CELLS_ACROSS, GRADIENT_STEP, LEAST_STEEP, MOVES, NEAR_SIZE, OPENINGS, SAMPLED_SIZES, STEPS
+from .tuning import (
+    CELLS_ACROSS,
+    GRADIENT_STEP,
+    LEAST_STEEP,
+    MOVES,
+    NEAR_SIZE,
+    OPENINGS,
+    SAMPLED_SIZES,
+    STEPS,
+    USELESS_ERROR,
+)
 
 _APART = 0.7
 """Least distance of generators around concave creases from those beside surfaces inside, over h."""
@@ -421,6 +431,20 @@ def _sample(prepared: Prepared) -> np.ndarray:
     if options.start == "uniform":
         return sample_uniform(setup.free, n, options.seed, real)
     return sample_density(setup.sizing, setup.free, n, options.seed, real, prepared.tree)
+
+
+def is_far(prepared: Prepared, mesh: MeshState) -> str:
+    """Return in words why the points of the caller, whose mesh is `mesh`, are of no use; empty if they are."""
+    options = prepared.options
+    if prepared.points is None or not options.multilevel or options.levels != "auto":
+        return ""
+    mean = mesh.summaries.read()["error"].magnitude / mesh.total
+    if mean <= USELESS_ERROR:
+        return ""
+    return (
+        f"the given mesh is far from the sizes, and a new one was made (mean |e| {mean:.2g}; far means above "
+        f"{USELESS_ERROR:g})"
+    )
 
 
 def only_needs_correction(prepared: Prepared, mesh: MeshState) -> tuple[bool, str]:

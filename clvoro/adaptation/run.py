@@ -43,7 +43,7 @@ from .options import Checkpoint, Options, uses
 from .plan.actions import CorrectCount, Refine, Step
 from .plan.efforts import EFFORTS
 from .plan.schedule import work_of
-from .preparation import Plan, Prepared, only_needs_correction, plan, prepare, start
+from .preparation import Plan, Prepared, is_far, only_needs_correction, plan, prepare, start
 from .stages import Stages
 from .tuning import REACHED, RENEWAL, WINDOW
 
@@ -139,18 +139,26 @@ class Run:
         )
 
     def _begin(
-        self, size: object, points: np.ndarray | None, max_levels: int | None = None, saved: Saved | None = None
+        self,
+        size: object,
+        points: np.ndarray | None,
+        max_levels: int | None = None,
+        saved: Saved | None = None,
+        path: str = "",
     ) -> None:
-        """Prepare a run, and make its first mesh or read it from a checkpoint."""
+        """Prepare a run, and make its first mesh or read it from a checkpoint.
+
+        The mesh is not that of `points` if `path` says why they are of no use.
+        """
         stages, options, files = self._stages, self._options, self._files
         fingerprint: dict[str, Any] = {}
         if saved is not None or files.path is not None:
             fingerprint = run_fingerprint(self._domain, vars(options), stages.engine.real, points, self._fixed)
         if saved is not None:
             saved.check_fingerprint(fingerprint)
-            max_levels = saved.levels
+            max_levels, path = saved.levels, saved.path
         prepared = stages.engine.peers.agree(
-            lambda: prepare(stages, self._domain, size, points, options, max_levels, self._fixed),
+            lambda: prepare(stages, self._domain, size, None if path else points, options, max_levels, self._fixed),
             lambda made: f"{self._domain!r} {options} {made.required!r} {made.target} {made.levels}",
         )
         if hasattr(self, "state"):
@@ -162,11 +170,16 @@ class Run:
             try:
                 self.state = start(prepared)
             except FewCellsError as error:
-                self._begin(size, points, self._fewer_levels(prepared.levels, error))
+                self._begin(size, points, self._fewer_levels(prepared.levels, error), path=path)
+                return
+            if why := is_far(prepared, self.state):
+                self._begin(size, points, path=why)
                 return
             self.near, self._path = only_needs_correction(prepared, self.state)
         else:
             self.near, self._path = saved.near, ""
+        self.drawn_because = path
+        self._path = path or self._path
         self._size, self._points = size, points
         planned = plan(prepared, self.near)
         self._writer = None
@@ -209,7 +222,7 @@ class Run:
         options = self._options
         settings = {
             **vars(options),
-            "start": options.start if self._points is None else "points",
+            "start": options.start if self._points is None or self.drawn_because else "points",
             "levels": self.levels,
             "error_target": planned.error_target,
             "dtype": self._stages.engine.real.name,
@@ -317,7 +330,7 @@ class Run:
                     self.position += 1
                     self._keep()
         except FewCellsError as error:
-            self._begin(self._size, self._points, self._fewer_levels(self.levels, error))
+            self._begin(self._size, self._points, self._fewer_levels(self.levels, error), path=self.drawn_because)
             return self._advance()
         return len(self.rows) > known
 
@@ -488,7 +501,9 @@ class Run:
         size = mesh.to_host(mesh.h, mesh.domain.frame[1])
         error, quality = mesh.to_host(mesh.error), mesh.to_host(mesh.quality)
         origin, fixed = origins(labels, self.started, mesh.taken), mesh.setup.points
-        if self._kept_rows is not None:
+        if self.drawn_because:
+            origin = np.full_like(origin, -1)
+        elif self._kept_rows is not None:
             origin = np.where(origin < 0, -1, self._kept_rows[origin]).astype(np.int32)
         parts = None
         if not self._whole:

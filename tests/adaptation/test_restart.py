@@ -126,3 +126,23 @@ def test_the_result_says_whether_it_was_corrected_and_why(ctx):
     assert near.settings["path"].startswith("the given mesh is near and only corrected (mean |e| 0.0")
     assert far.summary()["path"].startswith("the given mesh is not near, and all steps were taken (mean |e| 0.")
     assert near.summary()["steps"] < far.summary()["steps"]
+
+
+def test_a_mesh_far_from_the_sizes_is_replaced(ctx, tmp_path):
+    """Its fine cells are elsewhere: there is no path on one level from them to good cells of the right sizes."""
+    box, adapter, state = clvoro.Box((0, 0), (4, 1)), clvoro.Adapter(ctx), tmp_path / "state"
+    there, here = (sizing.Distance(sizing.Circle((x, 0.5), 0.1), 0.03, slope=0.3, h_max=0.3) for x in (0.5, 3.5))
+    points = adapter.run(box, there, "fast").points
+    one = clvoro.MultilevelOptions(levels=0)
+    new, kept = adapter.run(box, here, "fast"), adapter.run(box, here, "fast", points=points, options=one)
+    every = {"points": points, "checkpoint": clvoro.Checkpoint(state, every=0)}
+    whole = adapter.run(box, here, "fast", **every)
+    adapter.run(box, here, "fast", callback=lambda row: row["step"] == 6, **every)
+    rest = adapter.run(box, here, "fast", points=points, checkpoint=clvoro.Checkpoint(resume=state))
+    assert (kept.origin >= 0).any()
+    assert np.abs(whole.size_error).mean() < 2 * np.abs(new.size_error).mean()
+    for result in (whole, rest):
+        np.testing.assert_array_equal(result.points, whole.points)
+        assert result.settings["path"].startswith("the given mesh is far from the sizes, and a new one was made")
+        assert result.settings["start"] == "density"
+        assert (result.origin == -1).all()
