@@ -54,7 +54,7 @@ def charted(
     return (domain, field) if chart is domain else (chart, Charted(field, domain))
 
 
-_ATTEMPTS = 40
+_ATTEMPTS = 60  # the last 40 halve the distance of a point from one that is inside
 _ULPS = 4  # least distance of points from the boundary of a polygon
 _MAX_BOXES = 1 << 15  # over a polygon, for uniform points
 _MAX_EXPECTED = 1.0  # points per box

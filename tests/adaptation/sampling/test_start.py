@@ -5,10 +5,10 @@ import math
 import numpy as np
 import pytest
 
-from clvoro import sizing
+from clvoro import Solid, sizing
 from clvoro.adaptation.sampling.box_tree import BoxTree, hilbert_tables
 from clvoro.adaptation.sampling.quadrature import DensityTree
-from clvoro.adaptation.sampling.start import count_cells, sample_density, sample_uniform
+from clvoro.adaptation.sampling.start import _distinct, count_cells, sample_density, sample_uniform
 from clvoro.errors import InputError, InputTypeError
 from clvoro.geometry.box import Box
 from clvoro.opencl.engine import Engine
@@ -306,3 +306,12 @@ def test_callable_and_number_as_field():
     assert count_cells(cone, BOX) == pytest.approx(587.8113, rel=1.5e-4)
     assert np.array_equal(sample_density(cone, BOX, 60, 5), sample_density(F1, BOX, 60, 5))
     assert sample_density(0.1, BOX, 375, 5).shape == (375, 2)
+
+
+def test_draws_reach_a_point_just_below_the_surface_of_a_solid():
+    cube, inner = Solid.box((0, 0, 0), (1, 1, 1)), np.array([[1 - 1e-10, 0.5, 0.5]])
+
+    def draw(rows, attempt):
+        return inner[rows] + 0.5 ** max(0, attempt - 20) * np.array([0.1, 0.2, 0.2])
+
+    assert cube.contains(_distinct(draw, cube, 1, np.dtype(float))).all()
