@@ -26,12 +26,13 @@ from ..geometry.domain import Domain
 from ..mesh.results import HISTORY_DTYPE, Displacements
 from .insertion_deletion import Generators
 from .plan.actions import Action, Step
+from .preparation import GivenPoints
 from .state import Arrays, MeshState, Setup
 
 if TYPE_CHECKING:
     from .run import Run
 
-FORMAT, VERSION = "clvoro-checkpoint", 10
+FORMAT, VERSION = "clvoro-checkpoint", 11
 _GENERATORS = tuple(field.name for field in dataclasses.fields(Generators))
 _OTHERS = ("potential", "multipliers", "weights")
 _COUNTS = ("position", "level", "levels", "n_start", "started", "steps", "next_label", "pace")
@@ -98,8 +99,7 @@ class Checkpointer:
             "position": run.position,
             "level": run.level,
             "levels": run.levels,
-            "near": run.near,
-            "path": run.drawn_because,
+            "given": run.given,
             "n_start": run.n_start,
             "started": run.started,
             "steps": run.steps,
@@ -125,10 +125,8 @@ class Saved:
     ----------
     levels : int
         Number of coarser levels of the run.
-    near : bool
-        Whether the run only corrects a given mesh.
-    path : str
-        Why the run does not begin with the given points; empty if it does.
+    given : GivenPoints
+        What the run makes of the points of the caller.
 
     Raises
     ------
@@ -155,7 +153,8 @@ class Saved:
                 raise ValueError("counts")
             self.size_factor = float.fromhex(state["size_factor"])
             self.elapsed = float(state["elapsed"])
-            self.levels, self.near, self.path = int(state["levels"]), bool(state["near"]), str(state["path"])
+            near, replaced, why = state["given"]
+            self.levels, self.given = int(state["levels"]), GivenPoints(bool(near), bool(replaced), str(why))
             if not (0 < self.size_factor < np.inf and 0 <= self.elapsed < np.inf and state["level"] <= self.levels):
                 raise ValueError("size_factor")
             self._check(len(self.fingerprint["domain"]["lower"]), np.dtype(self.fingerprint["dtype"]))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -94,6 +95,24 @@ class Prepared:
     levels: int
     kept_rows: np.ndarray | None
     memory: float
+
+
+class GivenPoints(NamedTuple):
+    """What a run makes of the points of the caller.
+
+    Attributes
+    ----------
+    near : bool
+        Their mesh nearly has the sizes: it is only corrected.
+    replaced : bool
+        Their mesh is far from the sizes: the run begins with random points.
+    why : str
+        The reason, for the settings of the result; empty if there are no points, or the method keeps their number.
+    """
+
+    near: bool = False
+    replaced: bool = False
+    why: str = ""
 
 
 @dataclass(frozen=True)
@@ -433,38 +452,31 @@ def _sample(prepared: Prepared) -> np.ndarray:
     return sample_density(setup.sizing, setup.free, n, options.seed, real, prepared.tree)
 
 
-def is_far(prepared: Prepared, mesh: MeshState) -> str:
-    """Return in words why the points of the caller, whose mesh is `mesh`, are of no use; empty if they are."""
-    options = prepared.options
-    if prepared.points is None or not options.multilevel or options.levels != "auto":
-        return ""
-    mean = mesh.summaries.read()["error"].magnitude / mesh.total
-    if mean <= USELESS_ERROR:
-        return ""
-    return (
-        f"the given mesh is far from the sizes, and a new one was made (mean |e| {mean:.2g}; far means above "
-        f"{USELESS_ERROR:g})"
-    )
-
-
-def only_needs_correction(prepared: Prepared, mesh: MeshState) -> tuple[bool, str]:
-    """Return whether the points of the caller are a mesh that only needs a correction, and why; `mesh` is theirs."""
+def judge_points(prepared: Prepared, mesh: MeshState) -> GivenPoints:
+    """Return what the run makes of the points of the caller, whose mesh is `mesh`."""
     options, n = prepared.options, mesh.total
     if prepared.points is None or not options.multilevel:
-        return False, ""
-    if prepared.levels:
-        return False, f"the given points are too few to be corrected: {prepared.levels} refinements led to the sizes"
-    missing = mesh.missing_cells() if options.n_cells is None else float(options.n_cells - n)
+        return GivenPoints()
     s = mesh.summaries.read()
-    dim = prepared.setup.domain.cell_dim
     mean, quality = s["error"].magnitude / n, s["quality"].sum / n
-    near = is_near(dim, options.effort, n, missing, mean, quality)
+    if mean > USELESS_ERROR and options.levels == "auto":
+        return GivenPoints(
+            replaced=True,
+            why=f"the given mesh is far from the sizes, and a new one was made (mean |e| {mean:.2g}; far means above "
+            f"{USELESS_ERROR:g})",
+        )
+    if prepared.levels:
+        return GivenPoints(
+            why=f"the given points are too few to be corrected: {prepared.levels} refinements led to the sizes"
+        )
+    missing = mesh.missing_cells() if options.n_cells is None else float(options.n_cells - n)
+    near = is_near(prepared.setup.domain.cell_dim, options.effort, n, missing, mean, quality)
     off = f"{abs(missing) / n:.1%} of the cells too {'few' if missing > 0 else 'many'}"
     found = f"mean |e| {mean:.2g}, {off}, mean Q {quality:.3f}"
     if near:
-        return True, f"the given mesh is near and only corrected ({found})"
-    return False, (
-        f"the given mesh is not near, and all steps were taken ({found}; near means at most {NEAR_ERROR:g}, "
+        return GivenPoints(near=True, why=f"the given mesh is near and only corrected ({found})")
+    return GivenPoints(
+        why=f"the given mesh is not near, and all steps were taken ({found}; near means at most {NEAR_ERROR:g}, "
         f"{NEAR_COUNT:.0%}, and regular cells)"
     )
 

@@ -43,7 +43,7 @@ from .options import Checkpoint, Options, uses
 from .plan.actions import CorrectCount, Refine, Step
 from .plan.efforts import EFFORTS
 from .plan.schedule import work_of
-from .preparation import Plan, Prepared, is_far, only_needs_correction, plan, prepare, start
+from .preparation import GivenPoints, Plan, Prepared, judge_points, plan, prepare, start
 from .stages import Stages
 from .tuning import REACHED, RENEWAL, WINDOW
 
@@ -144,11 +144,11 @@ class Run:
         points: np.ndarray | None,
         max_levels: int | None = None,
         saved: Saved | None = None,
-        path: str = "",
+        given: GivenPoints | None = None,
     ) -> None:
         """Prepare a run, and make its first mesh or read it from a checkpoint.
 
-        The mesh is not that of `points` if `path` says why they are of no use.
+        `given` is what is known of `points`, from a first try or the checkpoint.
         """
         stages, options, files = self._stages, self._options, self._files
         fingerprint: dict[str, Any] = {}
@@ -156,9 +156,10 @@ class Run:
             fingerprint = run_fingerprint(self._domain, vars(options), stages.engine.real, points, self._fixed)
         if saved is not None:
             saved.check_fingerprint(fingerprint)
-            max_levels, path = saved.levels, saved.path
+            max_levels, given = saved.levels, saved.given
+        used = None if given is not None and given.replaced else points
         prepared = stages.engine.peers.agree(
-            lambda: prepare(stages, self._domain, size, None if path else points, options, max_levels, self._fixed),
+            lambda: prepare(stages, self._domain, size, used, options, max_levels, self._fixed),
             lambda made: f"{self._domain!r} {options} {made.required!r} {made.target} {made.levels}",
         )
         if hasattr(self, "state"):
@@ -170,18 +171,16 @@ class Run:
             try:
                 self.state = start(prepared)
             except FewCellsError as error:
-                self._begin(size, points, self._fewer_levels(prepared.levels, error), path=path)
+                self._begin(size, points, self._fewer_levels(prepared.levels, error), given=given)
                 return
-            if why := is_far(prepared, self.state):
-                self._begin(size, points, path=why)
+        if given is None:
+            given = judge_points(prepared, self.state)
+            if given.replaced:
+                self._begin(size, points, given=given)
                 return
-            self.near, self._path = only_needs_correction(prepared, self.state)
-        else:
-            self.near, self._path = saved.near, ""
-        self.drawn_because = path
-        self._path = path or self._path
+        self.given = given
         self._size, self._points = size, points
-        planned = plan(prepared, self.near)
+        planned = plan(prepared, given.near)
         self._writer = None
         if files.path is not None:
             self._writer = Checkpointer(files.path, files.every, fingerprint, planned.schedule)
@@ -222,7 +221,7 @@ class Run:
         options = self._options
         settings = {
             **vars(options),
-            "start": options.start if self._points is None or self.drawn_because else "points",
+            "start": options.start if self._points is None or self.given.replaced else "points",
             "levels": self.levels,
             "error_target": planned.error_target,
             "dtype": self._stages.engine.real.name,
@@ -232,7 +231,7 @@ class Run:
         used = {name: value for name, value in settings.items() if uses(options.method, name)}
         widths = widths_of_layers(as_field(self._size), self._domain, options.layers) if options.layers else ""
         used |= {"widths": widths} if widths else {}
-        used |= {"path": self._path} if self._path else {}
+        used |= {"path": self.given.why} if self.given.why else {}
         return {**used, "trade": planned.trade} if options.multilevel else used
 
     def _fewer_levels(self, levels: int, error: FewCellsError) -> int:
@@ -330,7 +329,12 @@ class Run:
                     self.position += 1
                     self._keep()
         except FewCellsError as error:
-            self._begin(self._size, self._points, self._fewer_levels(self.levels, error), path=self.drawn_because)
+            self._begin(
+                self._size,
+                self._points,
+                self._fewer_levels(self.levels, error),
+                given=self.given if self.given.replaced else None,
+            )
             return self._advance()
         return len(self.rows) > known
 
@@ -501,7 +505,7 @@ class Run:
         size = mesh.to_host(mesh.h, mesh.domain.frame[1])
         error, quality = mesh.to_host(mesh.error), mesh.to_host(mesh.quality)
         origin, fixed = origins(labels, self.started, mesh.taken), mesh.setup.points
-        if self.drawn_because:
+        if self.given.replaced:
             origin = np.full_like(origin, -1)
         elif self._kept_rows is not None:
             origin = np.where(origin < 0, -1, self._kept_rows[origin]).astype(np.int32)
