@@ -280,10 +280,10 @@ def _of_arrays(path: Path, wanted: tuple[str, ...] | None, time: float | None) -
         raise FileError(f"it has the arrays {', '.join(names):.300}, expected points (n, d) among them")
     places = read_array(path, "points").astype(float)
     names.remove("points")
-    values = {name: read_array(path, name) for name in names if wanted is None or name in wanted}
-    if wanted is None:  # without numbers of the whole, and texts
-        values = {name: rows for name, rows in values.items() if rows.ndim and rows.dtype.kind not in "SU"}
-    values = {name: values[name] for name in _chosen(wanted, values if wanted is None else names)}
+    values = {name: read_array(path, name) for name in _chosen(wanted, names)}
+    if wanted is None:
+        fields = [name for name, rows in values.items() if rows.ndim and rows.dtype.kind not in "SU"]
+        values = {name: values[name] for name in _chosen(None, fields)}  # without single numbers and texts
     for name, rows in values.items():
         if rows.dtype.kind not in "biuf" or not rows.ndim or not rows[:1].size:
             raise FileError(f"{name} has shape {rows.shape} and dtype {rows.dtype}, expected (n,) or (n, k) numbers")
@@ -318,8 +318,8 @@ def _of_netcdf(path: Path, wanted: tuple[str, ...] | None, time: float | None) -
 def _coordinates(file: Variables, name: str) -> tuple[tuple[str, ...], str, bool] | None:
     """Return where the values of a variable are; None if the file does not say it.
 
-    These are the names of the coordinates, which are variables of one dimension, that dimension, and whether they are
-    longitude and latitude.
+    Returns the names of the variables with the coordinates, the name of their dimension, and whether they are
+    longitudes and latitudes.
     """
     dims = file.dimensions(name)
     sphere = str(file.attribute("on_a_sphere")).strip().upper() == "YES"
