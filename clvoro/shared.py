@@ -39,7 +39,7 @@ def shared_adapter() -> Adapter:
 
 
 def _by_all(name: str, method: Callable[Concatenate[Adapter, Arguments], Answer]) -> Callable[Arguments, Answer]:
-    """Return a function `name` that calls a method of the shared adapter; it has its signature and docstring."""
+    """Return `method` of the shared adapter as a function `name`, with its signature and docstring."""
 
     @functools.wraps(method)
     def call(*args: Arguments.args, **options: Arguments.kwargs) -> Answer:

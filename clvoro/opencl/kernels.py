@@ -58,7 +58,7 @@ class KernelPool:
         self._ranges: dict[tuple[int, str], Range] = {}
         self.users: weakref.WeakValueDictionary[int, Kernels] = weakref.WeakValueDictionary()
         self.optimized = 0
-        """How many optimizations of programs it knows of; see `prebuild.renew`."""
+        """How many of the optimizations that have ended its kernels are from; see `prebuild.renew`."""
         self.on_kernel: Callable[[int], object] | None = None
         """Called with the number of kernels that have been taken, when there is a new one."""
         self.on_work: Callable[[str], object] | None = None
@@ -85,7 +85,7 @@ class KernelPool:
         self._taken.clear()
 
     def renew(self) -> None:
-        """Let all that hold kernels of this pool build their programs again when they next use them."""
+        """Drop the kernels in use: each is taken from a program that is built again when it is next used."""
         for kernels in list(self.users.values()):
             kernels.forget()
 
@@ -126,7 +126,7 @@ class Kernels(SimpleNamespace):
         return kernel
 
     def forget(self) -> None:
-        """Forget all kernels: they are taken again from the program that `build` then returns."""
+        """Drop all kernels: the next use of each calls `build` again."""
         for name in [name for name in vars(self) if not name.startswith("_")]:
             delattr(self, name)
 

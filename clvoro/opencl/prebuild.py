@@ -8,8 +8,8 @@ worker processes (`build_worker`) build kernels into PoCL's cache. `first_kernel
 of run; `bench/first_run.py --record` writes it. The workers begin with the kernels that are needed last. This process
 builds those that it needs before a worker has built them.
 
-A first run takes kernels without optimization, which are built in less than half of the time and give the same bits.
-The workers then build the optimized ones, which replace them (`renew`).
+The kernels of a first run are built without optimization: in less than half of the time, and with the same results to
+the last bit. The workers then build the optimized ones, which replace them (`renew`).
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ class FirstLaunch(NamedTuple):
 class Work(NamedTuple):
     """What a worker builds: text and options of programs, and launches in the order of building.
 
-    It builds programs from number `patient` on with a lower priority.
+    From the first launch of program number `patient`, or a later one, the worker has a lower priority.
     """
 
     programs: list[tuple[str, tuple[str, ...]]]
@@ -74,7 +74,7 @@ class Work(NamedTuple):
 
 
 class Optimization(NamedTuple):
-    """Programs that `workers` optimize while this process uses them without. `marker` then says that it is done."""
+    """Programs that `workers` build with optimization, and the file `marker` that says later that they have done so."""
 
     programs: list[tuple[str, tuple[str, ...]]]
     workers: list[subprocess.Popen[bytes]]
@@ -129,7 +129,7 @@ def build_ahead(engine: Engine, job: str = "") -> int:
 
 
 def renew(engine: Engine) -> None:
-    """Let `engine` take optimized kernels if workers have built more of them."""
+    """Let `engine` use optimized kernels if workers have finished some since the last call."""
     global _optimized
     with _lock:
         for optimization in _under_way[:]:
@@ -206,7 +206,7 @@ def _marker(what: str, device: cl.Device) -> Path | None:
 
 
 def _mark(marker: Path) -> bool:
-    """Make the file `marker`; return whether it has not been there."""
+    """Make the file `marker`; return False if it is there already, or cannot be made."""
     with contextlib.suppress(OSError):
         marker.open("x").close()
         return True

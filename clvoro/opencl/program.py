@@ -31,7 +31,7 @@ _threads: list[threading.Thread] = []
 _ending = threading.Event()
 _silent = 0
 quick: set[tuple[str, tuple[str, ...]]] = set()
-"""Programs, as text and options, that are built without optimization as long as they are here; see `prebuild`."""
+"""Text and options of programs that are now built without optimization; see `prebuild`."""
 _IGNORED = ("ignore", None, cl.CompilerWarning, None, 0)
 NO_ABI_WARNINGS = '#pragma clang diagnostic ignored "-Wpsabi"\n'
 """Put before programs for PoCL. On a CPU without AVX-512 clang warns that other compilers pass vectors of eight doubles

@@ -17,12 +17,13 @@ GRAVITY, ROTATION, DEPTH = 9.80616, 7.292e-5, 4000.0
 globe = clvoro.Sphere(6.37122e6)
 
 # %%
-# The solver. Momentum is a vector in space; its flux is made tangent to the sphere. Values at a face are extrapolated from both cells;
-# the flux is that of Rusanov. A face is a great circle with one normal, so that a sea at rest stays at rest.
+# The solver. The state of a cell is the depth h and the momentum h v, where the velocity v has three components in space. The component of the
+# change that would leave the sphere is removed. Values at a face are extrapolated from the cells on both sides, and Rusanov's flux is computed
+# from them. A face is an arc of a great circle, which has one normal, so that a sea at rest stays at rest.
 
 
 def rate(mesh, state):
-    """Return d/dt of the depth and the momentum, (n, 4)."""
+    """Return the rates of change of the depth and of the three components of the momentum, (n, 4)."""
     f, n = mesh.faces, len(mesh)
     slopes = sizing.derivatives(state, on=mesh)[0]
     sides = [
@@ -69,8 +70,8 @@ after = advance(mesh, zonal, 86400)
 print(f"test 2: the depth is off by {np.sqrt(np.mean((after[:, 0] / h - 1) ** 2)):.1e} after a day")
 
 # %%
-# The hill is at 30 degrees north. Three times the mesh follows it; later, the wave as it is, and as it will be: the solver goes ahead on the
-# mesh before, and the mesh gets sizes for both ends of the part of time.
+# The hill is at 30 degrees north. The first mesh is adapted to it three times. Later meshes have to fit the wave for two hours: the solver
+# goes ahead on the old mesh, and the sizes are those for the wave now, after one hour and after two.
 
 
 def hill(mesh):
