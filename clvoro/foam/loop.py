@@ -461,7 +461,7 @@ class _Loop:
         if given is None:
             domain = foam.domain()
             with warnings.catch_warnings():
-                # The solver has another mesh: what it would say of this one does not matter.
+                # No solver uses this diagram, but only the mesh of the case.
                 warnings.simplefilter("ignore", MismatchWarning)
                 return self.adapter.diagram(domain, foam.centroids[:, : domain.dim])
         if not isinstance(given, Diagram):
@@ -534,10 +534,10 @@ class _Loop:
 
 
 def _generators(old: Diagram, size: Estimate) -> np.ndarray | Start:
-    """Return the generators of a mesh if they only need to be corrected for the sizes, else those of a new mesh.
+    """Return the generators of a mesh if they only need to be corrected for the sizes, else "density", for a new mesh.
 
-    From afar, as from a mesh that is graded around a wall to one that is coarse there, a run of one level needs more
-    steps than one without generators, and may leave fine cells where they are not wanted.
+    A run from other generators replaces them only where they are of no use at all. Else it takes about as long as a new
+    mesh, and its cells may be less regular, as around a cylinder (bench/cylinder.py, the first mesh that is followed).
     """
     error = old.volumes ** (1 / old.domain.cell_dim) / size(old.centroids) - 1
     return old.points if np.abs(error).mean() <= NEAR_ERROR else "density"
