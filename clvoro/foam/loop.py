@@ -536,8 +536,8 @@ class _Loop:
 def _generators(old: Diagram, size: Estimate) -> np.ndarray | Start:
     """Return the generators of a mesh if they only need to be corrected for the sizes, else "density", for a new mesh.
 
-    A run from other generators replaces them only where they are of no use at all. Else it takes about as long as a new
-    mesh, and its cells may be less regular, as around a cylinder (bench/cylinder.py, the first mesh that is followed).
+    A run replaces given generators only where the mean |e| is above 1. Below that, the mesh that it makes from them
+    takes as long as a new one, and its cells may be less regular (`bench/restart.py --moves 1 --by 30 --cold`).
     """
     error = old.volumes ** (1 / old.domain.cell_dim) / size(old.centroids) - 1
     return old.points if np.abs(error).mean() <= NEAR_ERROR else "density"
