@@ -122,9 +122,12 @@ def test_surfaces_inside_are_in_case_files(here, surfaces, names, extent):
     (here / "mine.toml").write_text(
         f"size = 0.3\n[domain]\nlower = [-1, -1, -1]\nupper = [1, 1, 1]\nsurfaces = {surfaces}"
     )
-    borders = load_case("mine.toml").domain.borders
-    assert borders.names == names
-    assert np.ptp(borders.surface.vertices, axis=0) == pytest.approx([extent] * 3)
+    case = load_case("mine.toml")
+    (here / "copy").mkdir()
+    for borders in (case.domain.borders, load_case(case.write(here / "copy")).domain.borders):
+        assert borders.names == names
+        assert np.ptp(borders.surface.vertices, axis=0) == pytest.approx([extent] * 3)
+    assert case.copies() == ["part.off"]
 
 
 # Bad input.

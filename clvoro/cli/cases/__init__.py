@@ -188,7 +188,11 @@ def _files(node: Any) -> Iterator[tuple[dict[str, Any], str]]:
         if isinstance(item, (dict, list)):
             yield from _files(item)
     if isinstance(node, dict):
-        yield from ((node, key) for key in ("file", "points", "fixed", "land") if isinstance(node.get(key), str))
+        yield from (
+            (node, key)
+            for key in ("file", "points", "fixed", "land", "lines", "surfaces")
+            if isinstance(node.get(key), str)
+        )
 
 
 def _check_walls(table: dict[str, Any], domain: Domain, place: str) -> None:
