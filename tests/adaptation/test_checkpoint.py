@@ -25,6 +25,7 @@ BOX = clvoro.Box((0, 0), (2.5, 1.5))
 SIZE = clvoro.sizing.Expression("0.06 + 0.3*fabs(hypot(x-0.9, y-0.75)-0.3)")
 BOX_3D = clvoro.Box((0, 0, 0), (1, 1.5, 1))
 SIZE_3D = clvoro.sizing.Expression("0.16 + 0.2*fabs(hypot(x-0.4, y-0.7)-0.3)")
+CUBE = clvoro.Solid.box((0.3, 0.3, 0.3), (0.7, 1.2, 0.7))
 CORNER = clvoro.Polygon([(0, 0), (2, 0), (2, 1), (1, 1), (1, 2), (0, 2)])
 PERIODIC = clvoro.Box((0, 0), (1, 1), periodic=True)
 FEW = {"effort": "fast", "options": clvoro.MultilevelOptions(levels=1)}
@@ -34,6 +35,7 @@ RUNS = {
     "fixed": (BOX, SIZE, {**FEW, "fixed": [(0.4, 0.4), (1.7, 1.1)]}),
     "mmpde": (BOX, SIZE, {"method": "mmpde", "max_steps": 9}),
     "in 3D": (BOX_3D, SIZE_3D, {**FEW, "method": "exact"}),
+    "surfaces inside": (BOX_3D.with_surfaces(CUBE), 0.2, {**FEW, "method": "exact"}),
     "monge-ampere": (BOX, SIZE, {"method": "monge-ampere", "max_steps": 9}),
     "count held": (BOX, SIZE, {"method": "exact", "effort": "fast", "n_cells": 250}),
     "transport": (BOX, SIZE, {**FEW, "method": "transport"}),
@@ -80,7 +82,7 @@ def run(adapter, domain, size, path=None, every=0, **options):
 
 def fast(kind, dtype):
     """The others are for the slow set."""
-    return (kind, dtype) in (("coupled", "float64"), ("in 3D", "float64"), ("transport", "float32"))
+    return (kind, dtype) in (("coupled", "float64"), ("surfaces inside", "float64"), ("transport", "float32"))
 
 
 @pytest.mark.parametrize(
