@@ -13,8 +13,8 @@ from ..mesh.connectivity import distinct, following, take_rows
 from ..mesh.diagram import Diagram
 from ..mesh.faces import Faces
 from .collapse import collapse_short
-from .defects import DefectLimits
 from .gate import rejected_cells
+from .solid_walls.mend import NARROW, cells_of, narrow_faces, with_neighbors
 from .solid_walls.mesh import diagram_of
 
 _SMALL = 0.15
@@ -23,8 +23,8 @@ _ON_EDGE, _ON_CORNER = 0.12, 0.2
 """Vertices this near to an edge or a corner of a surface, over h, lie on it."""
 _FLAT = 1e-6
 """Vertices this near to a surface, over h, are on it."""
-_NARROW, _TINY = 0.08, 1e-3
-"""Faces between cells at surfaces that are collapsed, over h^2, if a cell is concave there; and in any case."""
+_TINY = 1e-3
+"""Smaller faces between cells near surfaces, over h^2, are collapsed."""
 _COLLAPSES, _TRIALS = 3, 20
 _ROUNDS = 4
 """How often vertices at walls are moved to the surface, and back to the walls."""
@@ -51,7 +51,7 @@ def on_surfaces(diagram: Diagram, sheets: Sheets) -> Diagram:
         mesh = _with_pairs_only(mesh, rows, small, vertices)
     made = _moved(mesh, sheets, h)
     for _ in range(_COLLAPSES):
-        narrow = _narrow_faces(made, h)
+        narrow = _faces_to_collapse(made, h)
         if not narrow.any():
             break
         made = _moved(collapse_short(made.faces, made, narrow, narrow), sheets, h)
@@ -61,7 +61,7 @@ def on_surfaces(diagram: Diagram, sheets: Sheets) -> Diagram:
         mesh = made.faces
         of_rejected = np.isin(mesh.owner, rejected) | np.isin(mesh.neighbor, rejected)
         size = np.minimum(h[mesh.owner], h[np.maximum(mesh.neighbor, 0)]) ** 2
-        narrow = np.flatnonzero((of_rejected & (mesh.area < _NARROW * size))[: mesh.n_inner])
+        narrow = np.flatnonzero((of_rejected & (mesh.area < NARROW * size))[: mesh.n_inner])
         narrow = narrow[np.argsort((mesh.area / size)[narrow], kind="stable")][tried:]
         if not len(narrow):
             break
@@ -95,33 +95,25 @@ def _moved(mesh: Faces, sheets: Sheets, h: np.ndarray) -> Diagram:
     vertices, size = _vertices(mesh, rows, np.minimum(h[mesh.owner[rows]], h[mesh.neighbor[rows]]))
     points = mesh.points.copy()
     points[vertices] = _onto(mesh, sheets, vertices, size)
-    return diagram_of(replace(mesh, points=points, diagram=None))
+    made = diagram_of(replace(mesh, points=points, diagram=None))
+    made.border_faces = rows
+    return made
 
 
 def _beside(diagram: Diagram) -> np.ndarray:
-    """Return which cells have vertices on surfaces: those at surfaces, and those beside these; (n,) bool."""
-    mesh, rows = diagram.faces, diagram.border_faces
-    beside = np.zeros(mesh.n_cells, bool)
-    beside[mesh.owner[rows]] = beside[mesh.neighbor[rows]] = True
-    one, other = mesh.owner[: mesh.n_inner], mesh.neighbor[: mesh.n_inner]
-    ring = np.concatenate([one[beside[other]], other[beside[one]]])
-    beside[ring] = True
-    return beside
+    """Return which cells have a face on a surface, or a neighbor with such a face, (n,) bool."""
+    on_surface = np.zeros(len(diagram.faces), bool)
+    on_surface[diagram.border_faces] = True
+    return with_neighbors(diagram.faces, cells_of(diagram.faces, on_surface))
 
 
-def _narrow_faces(diagram: Diagram, h: np.ndarray) -> np.ndarray:
-    """Return the small faces with which cells at surfaces or beside these are concave, and those with the least area.
-
-    (f,) bool.
-    """
+def _faces_to_collapse(diagram: Diagram, h: np.ndarray) -> np.ndarray:
+    """Return the faces of cells near surfaces that are tiny, or small where a cell is concave, (f,) bool."""
     mesh, beside = diagram.faces, _beside(diagram)
-    size = np.minimum(h[mesh.owner], h[np.maximum(mesh.neighbor, 0)]) ** 2
-    chosen = np.zeros(len(mesh), bool)
-    chosen[mesh.measures.concave_pairs(DefectLimits().concavity, beside)[0]] = True
-    chosen &= mesh.area < _NARROW * size
-    chosen |= (mesh.area < _TINY * size) & (beside[mesh.owner] | beside[np.maximum(mesh.neighbor, 0)])
-    chosen[mesh.n_inner :] = False
-    return chosen
+    tiny = mesh.area < _TINY * np.minimum(h[mesh.owner], h[np.maximum(mesh.neighbor, 0)]) ** 2
+    tiny &= beside[mesh.owner] | beside[np.maximum(mesh.neighbor, 0)]
+    tiny[mesh.n_inner :] = False
+    return tiny | narrow_faces(mesh, h, beside)
 
 
 def _with_pairs_only(mesh: Faces, rows: np.ndarray, small: np.ndarray, vertices: np.ndarray) -> Faces:
@@ -168,30 +160,31 @@ def _with_pairs_only(mesh: Faces, rows: np.ndarray, small: np.ndarray, vertices:
 def _relabeled(mesh: Faces, to: np.ndarray) -> Faces:
     """Return a mesh whose vertices have become the vertices `to` (v,); faces with less than three are left out."""
     touched = np.unique(np.repeat(np.arange(len(mesh)), np.diff(mesh.starts))[to[mesh.corners] != mesh.corners])
-    corners, starts = to[mesh.corners], mesh.starts
-    loops = {}
-    for f in touched.tolist():
-        loop = corners[starts[f] : starts[f + 1]].tolist()
-        changed = True
-        while changed and len(loop) > 2:
-            changed = False
-            for k in range(len(loop)):
-                if loop[k] == loop[k - 1]:
-                    del loop[k]
-                elif loop[k - 2] == loop[k]:  # there and back
-                    for m in sorted(((k - 1) % len(loop), k), reverse=True):
-                        del loop[m]
-                else:
-                    continue
-                changed = True
-                break
-        loops[f] = loop
-    kept = np.array([f not in loops or len(loops[f]) > 2 for f in range(len(mesh))], bool)
-    rows = np.flatnonzero(kept)
-    lists = [loops.get(f) or corners[starts[f] : starts[f + 1]].tolist() for f in rows.tolist()]
-    begin = np.concatenate([[0], np.cumsum([len(loop) for loop in lists])])
-    flat = np.array([c for loop in lists for c in loop], np.int32)
-    return mesh.take_faces(rows, starts=begin, corners=flat).compact()
+    corners, stays = to[mesh.corners].astype(np.int32), np.ones(len(mesh.corners), bool)
+    for begin, end in zip(mesh.starts[touched].tolist(), mesh.starts[touched + 1].tolist(), strict=True):
+        left = _without_spikes(list(zip(corners[begin:end].tolist(), range(begin, end), strict=True)))
+        stays[begin:end] = False
+        stays[[place for _, place in left]] = len(left) > 2
+    counts = np.add.reduceat(stays, mesh.starts[:-1], dtype=np.int64)
+    rows = np.flatnonzero(counts)
+    starts = np.concatenate([[0], np.cumsum(counts[rows])])
+    return mesh.take_faces(rows, starts=starts, corners=corners[stays]).compact()
+
+
+def _without_spikes(loop: list[tuple[int, int]]) -> list[tuple[int, int]]:
+    """Return a loop of vertices and their places without repeated vertices, and without ways there and back."""
+    k = 0
+    while k < len(loop) and len(loop) > 2:
+        if loop[k][0] == loop[k - 1][0]:
+            del loop[k]
+        elif loop[k - 2][0] == loop[k][0]:
+            for m in sorted(((k - 1) % len(loop), k), reverse=True):
+                del loop[m]
+        else:
+            k += 1
+            continue
+        k = 0
+    return loop
 
 
 def _vertices(faces: Faces, rows: np.ndarray, size: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -8,12 +8,12 @@ from ...mesh.faces import Faces
 from ..defects import DefectLimits
 from ..gate import rejected_cells
 
-_NARROW = 0.08
+NARROW = 0.08
 """Faces between two cells are collapsed if they are smaller than this share of h^2 and a cell is concave there."""
 
 
-def narrow_faces(faces: Faces, sizes: np.ndarray, among: np.ndarray | None = None) -> np.ndarray:
-    """Return the small faces between two cells at a wall with which a cell is concave, (f,) bool.
+def narrow_faces(faces: Faces, sizes: np.ndarray, among: np.ndarray) -> np.ndarray:
+    """Return the small faces between two cells with which one of the cells `among` (n,) bool is concave, (f,) bool.
 
     Where a wall is curved, the common edge of two wall polygons may bulge out of the planes of both. So does the center
     of the face between their cells if that is small.
@@ -23,15 +23,13 @@ def narrow_faces(faces: Faces, sizes: np.ndarray, among: np.ndarray | None = Non
     faces : Faces
     sizes : (n,) float
         h of the cells.
-    among : (n,) bool, optional
-        The cells that are searched; by default all.
+    among : (n,) bool
     """
-    searched = _at_wall(faces) if among is None else _at_wall(faces) & among
     chosen = np.zeros(len(faces), bool)
-    chosen[faces.measures.concave_pairs(DefectLimits().concavity, searched)[0]] = True
+    chosen[faces.measures.concave_pairs(DefectLimits().concavity, among)[0]] = True
     chosen[faces.n_inner :] = False
     h = np.minimum(sizes[faces.owner], sizes[np.maximum(faces.neighbor, 0)])
-    return chosen & (faces.area < _NARROW * h**2)
+    return chosen & (faces.area < NARROW * h**2)
 
 
 def rejected_at_walls(faces: Faces, judged: np.ndarray) -> np.ndarray:

@@ -334,7 +334,7 @@ def _collapsed(faces: Faces, sizes: np.ndarray, among: np.ndarray | None = None)
     if among is not None:
         at_wall &= among
     chosen = at_wall[faces.owner] | at_wall[np.maximum(faces.neighbor, 0)]
-    made = collapse_short(diagram.faces, diagram, narrow_faces(diagram.faces, sizes, among), chosen)
+    made = collapse_short(diagram.faces, diagram, narrow_faces(diagram.faces, sizes, at_wall), chosen)
     row = np.full(len(diagram.neighbors), -1)
     row[diagram.faces.half_face] = np.arange(len(faces))
     before = row[made.half_face]
