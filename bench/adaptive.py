@@ -20,10 +20,10 @@ of the mesh. The columns "L1" and "L2" are the error over this optimum, each for
 error of the uniform mesh over it, and "predicted" the error that the last sizes predict over the true one. Targets:
 1.15 in the plane and on the sphere, 1.25 in space.
 
-Two more columns say where the rest comes from. "sizes" is the error over the optimum if all simplices were regular,
-with the volumes of the mesh's cells, at random places in them: what the sizes alone cost. L1 and L2 over "sizes" is
-the share of the shapes. With `--exact` the sizes come from the function's own second derivatives, averaged over a
-ball of the size of a cell: the difference is what the estimate costs.
+Two more columns say how much of this is due to sizes and how much to shapes. "sizes" is the error over the optimum if
+all simplices were regular, with the volumes of the mesh's cells, at random places in them. L1 and L2, divided by
+"sizes", are the factors due to shapes. With `--exact` the sizes come from the function's own second derivatives,
+averaged over a ball of the size of a cell: the difference is what the estimate costs.
 """
 
 from __future__ import annotations

@@ -15,7 +15,7 @@ range.
 
 --reference, such as 3000,12000,48000, finds the reference: on structured meshes of quadrilaterals between the body and
 the box, whose angles and ratios of radii are uniform; around the airfoil in the plane in which its chord is a circle.
-Their drag is extrapolated to cells of no size by Richardson's method. The flow around the sphere is that of a wedge, in
+Richardson's method extrapolates their drag to cells of size zero. The flow around the sphere is that of a wedge, in
 a round box with the cross-section of the square one.
 """
 
@@ -95,7 +95,7 @@ def around_sphere() -> clvoro.Solid:
 
 
 def lines_of_airfoil() -> tuple[np.ndarray, np.ndarray, Callable[[np.ndarray], np.ndarray]]:
-    """Return section and square where Joukowski's map makes a circle of its chord, and the map back.
+    """Return section and square as a Joukowski map, which makes a circle of the chord, maps them, and the map back.
 
     The chord begins at the focus of the nose. At the sharp tail, where stresses have a singularity, sizes of cells are
     proportional to the square of the angle.
@@ -116,7 +116,7 @@ def lines_of_airfoil() -> tuple[np.ndarray, np.ndarray, Callable[[np.ndarray], n
 
 
 def lines_of_sphere() -> tuple[np.ndarray, np.ndarray, Callable[[np.ndarray], np.ndarray]]:
-    """Return half of a circle, and of a section through a round box as long and as large across as the square one."""
+    """Return half of the sections of sphere and box; the box is round, with the length and area of the square one."""
     wide = 12 / math.sqrt(math.pi)
     corners = np.array([10, 10 + 1j * wide, -6 + 1j * wide, -6])
     return 0.5 * np.exp(1j * np.linspace(0, math.pi, 1001)), along(corners), lambda z: z
@@ -261,7 +261,7 @@ def solve(
 
 
 def extrapolated(cells: list[float], drags: list[float]) -> tuple[float, float, float]:
-    """Return the drag for cells of no size, its uncertainty, and the observed order of its error in h, of three meshes.
+    """Return the drag extrapolated to cells of size zero, its uncertainty, and the order of its error on three meshes.
 
     The error is proportional to h^2, which is 1 / cells in the plane. The uncertainty is the difference to the value
     without the finest mesh.

@@ -10,9 +10,9 @@ transferred by `Diagram.transfer`. The solver is of second order: linear functio
 Jespersen, upwind fluxes, and Heun's method. "L1" is the error over the integral of the disk. "mass" is the largest
 relative change of the integral in a transfer, "extrema" the largest excess over the values before one. "drift" is the
 largest deviation of the number of cells from that of the first mesh, without `n_cells`, "|e|" the largest mean error
-of the sizes, "Q" the least mean quality. "s" are seconds of the loop by the clock, from the first solution on, "cpu
-s" those of processor time, of these "solver", "mesh" and "transfer". Compare times within one call, and after a first
-call that has built the kernels.
+of the sizes, "Q" the least mean quality. "s" are seconds of the loop by the clock, from the first solution on,
+"cpu s" seconds of processor time, and "solver", "mesh" and "transfer" the parts of these. Compare times within one
+call, and after a first call that has built the kernels.
 """
 
 from __future__ import annotations

@@ -58,8 +58,8 @@ class Adapter:
         Precision on the device.
     comm : mpi4py.MPI.Comm, optional
         Share runs among the ranks of this communicator: all of them create an adapter and call `run` with the same
-        arguments. Each gets a `Result` of its own cells, and ``result.gather()`` returns the whole mesh on rank 0. In
-        boxes with walls, with the methods that neither transport nor map.
+        arguments. Each gets a `Result` of its own cells, and ``result.gather()`` returns the whole mesh on rank 0. For
+        boxes with walls, not for "transport", moving meshes, layers, fixed generators and checkpoints.
 
     Attributes
     ----------
@@ -212,7 +212,7 @@ class Adapter:
 
         `clvoro.voronoi` uses the adapter that all calls share, on the best device.
 
-        To have target sizes beside it, take no step from the points:
+        For a `Result`, which has target sizes, too, make a run that takes no step:
         ``clvoro.adapt(domain, size, points=points, method="lloyd", max_steps=0)``.
 
         Parameters

@@ -298,7 +298,7 @@ class _Loop:
         return self.read[folder]
 
     def _check_mesh(self, given: object) -> None:
-        """Raise InputError before the solver runs if its mesh cannot be followed by one of as many cells."""
+        """Raise InputError, before the solver runs, if `n_cells` is too small, or the domain is not found."""
         folder = self.case.mesh_folder(self.case.latest())
         foam = self._mesh_in(folder)
         self._check_count(foam)

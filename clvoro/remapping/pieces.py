@@ -89,7 +89,7 @@ def _between_corners(diagram: Diagram) -> Pieces:
         triangles, of = shapely.get_parts(parts, return_index=True)
         corners = shapely.get_coordinates(shapely.orient_polygons(triangles)).reshape(-1, 4, 2)[:, :3]
         a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-        # The lines through the sides of a thinner one bound nothing.
+        # By round-off, the lines through the sides of a thinner triangle may enclose nothing.
         thick = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0] > _THIN * diagram.volumes[bent[of]]
         corners, of = corners[thick], of[thick]
         items = np.concatenate([items, len(x) + np.arange(3 * len(corners))])
