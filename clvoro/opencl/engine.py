@@ -95,7 +95,7 @@ class Engine:
     pool : KernelPool, optional
         Kernels that stages take.
     peers : Peers
-        The parts of the domain, of which the stages work on one.
+        The parts of the domain. The stages work on one of them.
 
     Attributes
     ----------
@@ -144,8 +144,22 @@ class Engine:
         )
 
     def alone(self) -> Engine:
-        """Return an engine that shares kernels with this one, and works without the peers."""
+        """Return an engine for the whole domain that shares kernels with this one."""
         return Engine(self.ctx, self.queue, self.dim, self.real, self.traits, pool=self.pool)
+
+    def sum_over_parts(self, partial: cla.Array, *rows: int, largest: int | None = None) -> None:
+        """Replace these rows of partial sums by their sums over all parts, and row `largest` by the maximum.
+
+        `partial` (k * groups,) has a row of `groups` sums for each of k quantities.
+        """
+        if self.peers.count == 1:
+            return
+        sums, chosen = partial.get().reshape(-1, self.groups), list(rows)
+        found = np.stack(self.peers.gather(sums[chosen]))
+        sums[chosen] = found.sum(axis=0)
+        if largest is not None:
+            sums[largest] = found[:, chosen.index(largest)].max(axis=0)
+        partial.set(sums.ravel())
 
     @property
     def site_size(self) -> int:

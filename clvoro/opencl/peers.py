@@ -15,8 +15,8 @@ if TYPE_CHECKING:
 
 Made = TypeVar("Made")
 PATIENCE, NAP = 30, 2e-5
-"""How often a rank asks for a message before it sleeps between two questions, and for how many seconds. Ranks may be
-more than cores."""
+"""A rank that waits for a message sleeps for `NAP` seconds between two questions after the first `PATIENCE`. There may
+be more ranks than cores."""
 ALARM = 1
 """Tag of the message that a rank sends when it fails."""
 
@@ -31,7 +31,8 @@ class Peers:
     number, count : int
         Number of this part; number of parts.
     shared : bool
-        Whether the domain is one of parts: rows of cells are then in the order of labels. There may be a single part.
+        Whether the run is one over ranks, even if there is a single rank: the faces of a cell are then in the order of
+        the labels of neighbors.
     exchanges, reductions : int
         Calls of `exchange` and of `gather` so far.
     """
@@ -42,7 +43,7 @@ class Peers:
     def exchange(self, sent: Sequence[np.ndarray], sizes: ArrayLike | None = None) -> list[np.ndarray]:
         """Send array k to part k, and return what each part has sent to this one, in the order of parts.
 
-        Arrays differ in their number of rows only. `sizes` (p,) are those of the arrays that this part gets, if all
+        Arrays may differ in their number of rows. `sizes` (p,) are the numbers of rows that this part gets, if all
         parts know theirs.
         """
         return list(sent)
@@ -72,14 +73,14 @@ class Peers:
         return found if self.number == 0 else []
 
     def agree(self, prepare: Callable[[], Made], describe: Callable[[Made], str]) -> Made:
-        """Return what `prepare` returns, if the parts describe it alike.
+        """Call `prepare` in all parts, and return what it returns, if `describe` gives the same text in all of them.
 
         Raises
         ------
         InputError
-            If they do not.
+            If texts differ.
         RankError
-            If it raises an error in another part.
+            If `prepare` raises an error in another part.
         """
         if self.count == 1:
             return prepare()
@@ -100,8 +101,8 @@ class Peers:
         differ = [number for number, other in enumerate(found) if other != found[0]]
         if differ:
             raise InputError(
-                f"rank {differ[0]} has other input than rank 0, or another version of clvoro: {found[differ[0]]:.300} "
-                f"in place of {found[0]:.300}; give all ranks the same arguments"
+                f"rank {differ[0]} has other input than rank 0, or another version of clvoro: {found[differ[0]]:.300}, "
+                f"expected {found[0]:.300}; give all ranks the same arguments"
             )
         return cast("Made", made)
 
@@ -174,40 +175,6 @@ class Ranks(Peers):
                     self._failed = self._alarms.recv(tag=ALARM)
                     raise RankError(self._failed)
                 time.sleep(NAP)
-
-    def agree(self, prepare: Callable[[], Made], describe: Callable[[Made], str]) -> Made:
-        """Return what `prepare` returns, if the parts describe it alike.
-
-        Raises
-        ------
-        InputError
-            If they do not.
-        RankError
-            If it raises an error in another part.
-        """
-        if self.count == 1:
-            return prepare()
-        error, made, text = None, None, ""
-        try:
-            made = prepare()
-            text = describe(made)
-        except Exception as caught:
-            error, text = caught, f"\0{type(caught).__name__}: {caught}"
-        found = [
-            sent.tobytes().decode() for sent in self.exchange([np.frombuffer(text.encode(), np.uint8)] * self.count)
-        ]
-        if error is not None:
-            raise error
-        for number, other in enumerate(found):
-            if other.startswith("\0"):
-                raise RankError(f"rank {number} of {self.count} has failed: {other[1:]}")
-        differ = [number for number, other in enumerate(found) if other != found[0]]
-        if differ:
-            raise InputError(
-                f"rank {differ[0]} has other input than rank 0, or another version of clvoro: {found[differ[0]]:.300} "
-                f"in place of {found[0]:.300}; give all ranks the same arguments"
-            )
-        return cast("Made", made)
 
     def fail(self, error: BaseException) -> None:
         """Send the text of `error` to all other ranks."""

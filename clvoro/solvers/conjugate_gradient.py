@@ -57,18 +57,6 @@ class ConjugateGradient:
             )
         return self._kernels[store]
 
-    def sum_over_parts(self, *rows: int, largest: int | None = None) -> None:
-        """Replace these rows of the partial sums by their sums over all parts, and row `largest` by the maximum."""
-        peers = self.engine.peers
-        if peers.count == 1:
-            return
-        partial = self.partial.get().reshape(_ROWS, -1)
-        found = np.stack(peers.gather(partial[list(rows)]))
-        partial[list(rows)] = found.sum(axis=0)
-        if largest is not None:
-            partial[largest] = found[:, rows.index(largest)].max(axis=0)
-        self.partial.set(partial.ravel())
-
     @framed
     def solve(
         self,
@@ -341,7 +329,7 @@ class _Iteration:
         k, anew = self._kernels, np.int32(from_zero)
         partial, state, _ = self._tail
         self._launch(k.sum_right_sides, self._size, anew, self._rhs, self._q, partial)
-        self._solver.sum_over_parts(_SUM_B, _START, _MAX_B, largest=_MAX_B)
+        self._engine.sum_over_parts(partial, _SUM_B, _START, _MAX_B, largest=_MAX_B)
         self._launch(
             k.start_residual,
             self._size,
@@ -356,7 +344,7 @@ class _Iteration:
             state,
             self._solver.counts,
         )
-        self._solver.sum_over_parts(_NORM_B, _NORM_R, _SUM_R)
+        self._engine.sum_over_parts(partial, _NORM_B, _NORM_R, _SUM_R)
 
     def begin(self) -> None:
         """Precondition the first residual."""
@@ -364,7 +352,7 @@ class _Iteration:
             self._launch(
                 self._kernels.precondition_jacobi, self._size, self._precondition, self._r, self._u, self._tail[0]
             )
-            self._solver.sum_over_parts(_GAMMA)
+            self._engine.sum_over_parts(self._tail[0], _GAMMA)
 
     def iterate(self, k: int) -> None:
         """Enqueue iteration k."""
@@ -379,9 +367,9 @@ class _Iteration:
             self._operator.apply(self._p, self._q)
             if not self._operator.writes_curvature:
                 self._dot_product(CURVATURE, self._p, self._q)
-            self._solver.sum_over_parts(CURVATURE)
+            self._engine.sum_over_parts(self._tail[0], CURVATURE)
         solution()
-        self._solver.sum_over_parts(*(row + (k + 1) % 2 for row in (_NORM_R, _SUM_R, _GAMMA)))
+        self._engine.sum_over_parts(self._tail[0], *(row + (k + 1) % 2 for row in (_NORM_R, _SUM_R, _GAMMA)))
 
     def record_norm(self) -> None:
         """Record the residual before the next iteration, and whether it is needed."""
@@ -390,7 +378,7 @@ class _Iteration:
 
     def center(self) -> None:
         """Subtract its mean from x."""
-        self._solver.sum_over_parts(_SUM_X)
+        self._engine.sum_over_parts(self._tail[0], _SUM_X)
         self._launch(self._kernels.center_solution, self._size, self._center, self._x, self._tail[0])
 
     def _dot_product(self, row: int, a: cla.Array, b: cla.Array) -> None:

@@ -225,7 +225,7 @@ class Poisson:
         # These kernels are the same for both precisions of the weights, which are mostly single.
         partial, kernels = self._conjugate_gradient.partial, self._kernels_in(np.dtype(np.float32))
         self.engine.run_blocks(kernels.sum_sources, size, source, volumes, partial)
-        self._conjugate_gradient.sum_over_parts(0, 1)
+        self.engine.sum_over_parts(partial, 0, 1)
         self.engine.run_blocks(kernels.subtract_mean_source, size, source, volumes, rhs, partial)
         return rhs
 

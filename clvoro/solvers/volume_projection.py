@@ -194,7 +194,7 @@ class VolumeProjection:
             self._unread = ref(solution)
             return solution
         Launch(engine, k.assemble_projection, *given, self._counts, *rest)()
-        self._sum_over_parts(_NORM, _GAMMA)
+        engine.sum_over_parts(self._partial, _NORM, _GAMMA)
         direction = Launch(engine, k.update_projection_direction, *given, self._counts)
         update = Launch(engine, k.update_projection, *given, self._counts)
         rows = self._iterate(t, v, direction, update, most)
@@ -216,7 +216,6 @@ class VolumeProjection:
     ) -> tuple[object, ...]:
         """Return ASSEMBLY_ARGS of volume_projection.cl but for the start."""
         real, sums = self.engine.real.type, targets.sums
-
         if sums is not None and self.engine.peers.count > 1:
             sums = self.engine.upload(self.engine.peers.total(sums.get()))
 
@@ -249,29 +248,22 @@ class VolumeProjection:
         engine = self.engine
         t.forward(engine, v.z)
         direction()
-        self._sum_over_parts(_CURVATURE)
+        engine.sum_over_parts(self._partial, _CURVATURE)
         done, ahead = 0, self._ahead
         while True:
             end = min(done + ahead, most)
             for turn in range(done, end):
                 t.forward(engine, v.s)
                 update()
-                self._sum_over_parts(_NORM + (turn + 1) % 2, _GAMMA + (turn + 1) % 2)
+                engine.sum_over_parts(self._partial, _NORM + (turn + 1) % 2, _GAMMA + (turn + 1) % 2)
                 t.forward(engine, v.z)
                 direction()
-                self._sum_over_parts(_CURVATURE)
+                engine.sum_over_parts(self._partial, _CURVATURE)
             rows = self._read(end)
             if not all(row[RECORD_RUNNING] for row in rows):
                 self._ahead = _first_stop(rows) + _SPARE
                 return rows
             done, ahead = end, 4
-
-    def _sum_over_parts(self, *rows: int) -> None:
-        """Replace these rows of the partial sums by their sums over all parts."""
-        if self.engine.peers.count > 1:
-            partial = self._partial.get().reshape(_ROWS, -1)
-            partial[list(rows)] = self.engine.peers.total(partial[list(rows)])
-            self._partial.set(partial.ravel())
 
     def _read(self, end: int) -> list[list[float]]:
         """Return the rows of the record up to iteration `end`."""
