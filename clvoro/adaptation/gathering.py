@@ -1,4 +1,4 @@
-"""The result of a run over several parts: each has its own cells, and all of them gather the whole mesh."""
+"""The result of a run over several parts: each has its own cells, and part 0 can gather the whole mesh."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class ResultParts:
 
     @property
     def labels(self) -> np.ndarray:
-        """Names of the cells in the whole mesh, in the order of the rows of the result."""
+        """Permanent numbers of the cells of this part, (n,) int32, ascending, as in the whole mesh."""
         return np.sort(self.rows.labels)
 
     def together(self, work: Callable[[], None]) -> None:

@@ -77,7 +77,7 @@ def check_shared(domain: Domain, options: Options, fixed: object, checkpoint: ob
     if not domain.may_have_parts:
         what = f"domain is {domain!r:.80}, expected a Box with walls, without lines or surfaces inside"
     elif options.method in ("transport", *MOVING):
-        what = f"method is {options.method!r}, expected 'adaptive', or one that repeats a kind of step"
+        what = f"method is {options.method!r}, expected one other than {', '.join(map(repr, ('transport', *MOVING)))}"
     elif options.layers or fixed is not None or checkpoint is not None:
         what = "layers, fixed generators or a checkpoint are given, expected none of them"
     if what:

@@ -59,7 +59,7 @@ class OtherParts(Protocol):
 
     @property
     def labels(self) -> np.ndarray:
-        """Names of the cells in the whole mesh, in the order of rows, (n,) int32."""
+        """Permanent numbers of the cells of this part, (n,) int32, ascending, as in the whole mesh."""
         ...
 
     def gather(self, result: Result) -> Result | None:

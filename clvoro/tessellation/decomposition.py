@@ -1,4 +1,4 @@
-"""Which part owns which generators: runs of blocks of a Hilbert curve that all parts divide alike."""
+"""Which part owns which generators: successive blocks of a Hilbert curve. All parts find the same blocks."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from ..opencl.peers import Peers
 BITS = 20
 """Bits of a coordinate in the keys of the Hilbert curve."""
 BLOCKS = 1024
-"""A block has at most this share of the generators, unless many are at one place."""
+"""A block has at most one generator in so many, unless many are at one place."""
 UNBALANCED = 1.1
-"""Generators of the largest part over the mean, from which on they are divided anew."""
+"""Generators are divided anew if the largest part has more than so many times the mean."""
 
 
 def hilbert_keys(points: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
@@ -79,7 +79,9 @@ def is_balanced(n: int, peers: Peers) -> bool:
 
 
 def distribute(engine: Engine, box: ClipBox, rows: dict) -> dict:
-    """Return `rows`, device arrays of generators by name, with the generators that this part owns by their places.
+    """Return `rows`, device arrays of generators by name, with the generators that this part owns from now on.
+
+    The arrays given are freed.
 
     ``rows["points"]`` are in the device's coordinates in `box`. All parts call this together.
     """

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 
 SUMS = 256
-"""Partial sums over the cells of a part."""
+"""Number of partial sums over the cells of a part."""
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,7 @@ class Ghosts:
     def of_lists(
         cls, engine: Engine, peers: Peers, parts: np.ndarray, rows: np.ndarray, sent: Sequence[np.ndarray]
     ) -> Ghosts:
-        """Return the same, if the rows are known that each of the parts needs, `sent`."""
+        """Return the same, if this part knows already which of its rows each of the parts needs: `sent`."""
         sizes, counts = np.array([len(needed) for needed in sent]), np.bincount(parts, minlength=peers.count)
         needed = engine.upload(np.concatenate(sent), np.int32)
         return cls(engine.upload(rows, np.int32), None, None, peers, parts, needed, sizes, counts)
@@ -175,14 +175,15 @@ class Part:
 
     def neighboring_ghosts(self, engine: Engine, t: Tessellation) -> np.ndarray:
         """Return the rows of ghosts that are neighbors of own generators in `t`, a diagram of this part, (k,) int."""
-        marks = engine.zeros(max(self.count - self.n_own, 1), np.int32)
+        marks = engine.scratch(max(self.count - self.n_own, 1), np.int32)
+        marks.fill(0)
         engine.run_each(engine.kernels("tessellation/part").mark_ghosts, self.n_own, t.starts, t.neighbors, marks)
         return self.n_own + np.flatnonzero(marks.get()[: self.count - self.n_own])
 
     def sums(self, engine: Engine, t: Tessellation) -> np.ndarray:
-        """Return the volume of own cells, the signed sum of their faces with ghosts, and the sum of these, (3,).
+        """Return the volume of own cells, and of their faces with ghosts the signed sum and the sum of measures, (3,).
 
-        The second one is zero over all parts, if each face has both sides.
+        The signed sums of all parts add up to zero if each face between two parts has both sides.
         """
         sums = engine.scratch((SUMS, 3))
         given = (t.starts, t.neighbors, self.labels, t.face_measures, t.volumes)

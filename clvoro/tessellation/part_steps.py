@@ -1,10 +1,10 @@
 """The steps of a part of a domain: generators of other parts as ghosts, and the proof that there are enough of them.
 
-No generator lies in the ball around a corner of a cell that has the generator of the cell on its surface. All these
-balls of one cell lie in the ball around its generator of twice its reach, the distance of the farthest corner. So a
-cell is final if no other generator that this part does not know lies in that ball. Each part asks the owners of other
-generators, which it knows by boxes that contain them, for those in the balls of its cells. Where there are new ones,
-all parts make their cells again.
+A ball around a corner of a cell, with the generator of the cell on its surface, contains no generator. The reach of a
+cell is the distance of its farthest corner from its generator, and all these balls lie in the ball around the generator
+with twice this radius. So a cell is final if this part knows all generators in that ball. Each part tells the others
+the boxes that contain its generators, and asks those whose boxes meet its balls for the generators inside. If there are
+new ones, all parts make their cells again.
 """
 
 from __future__ import annotations
@@ -29,9 +29,10 @@ from .stages import TessellationStages
 from .steps import DomainSteps, Sort
 
 FIRST_REACH = 1.9, 2.4
-"""Radius of the first balls, in spacings of the generators around: for own cells; for those of neighbors, too."""
+"""Radius of the first balls over the spacing of the generators around: if only own cells have to be final, and if those
+of their neighbors have to be final, too."""
 JUMP = 3
-"""Spacings between two generators on the curve from which on a new box begins."""
+"""A new box begins where two successive generators on the curve are so many spacings apart."""
 CHUNK, CHUNKS = 16, 512
 """Least number of generators in a box, and largest number of boxes, that say where the generators of a part are."""
 SLACK = 1.05
@@ -41,7 +42,7 @@ NOISE = {"float64": 1e-6, "float32": 1e-4}
 FILLED, MATCHED = {"float64": 1e-8, "float32": 1e-3}, {"float64": 1e-5, "float32": 1e-3}
 """Largest differences of the volume of all cells from that of the domain, and of both sides of faces between parts."""
 GROUP = 64
-"""Balls whose common box is looked at first."""
+"""Number of balls in a group. The box around a group is compared with the boxes of generators first."""
 
 
 class Chunks:
@@ -60,7 +61,7 @@ class Chunks:
     firsts : (k,) int
         Where the chunks begin in `order`.
     spacings : (n,) float
-        Distances of generators that follow one another, in the median of those around.
+        For each generator the median distance of two successive ones in its chunk.
     """
 
     def __init__(self, points: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> None:
@@ -73,7 +74,7 @@ class Chunks:
         spacings = np.repeat(usual, np.diff(np.append(firsts, len(points))))
         self.spacings = np.empty(len(points))
         self.spacings[self.order] = spacings
-        # Generators may have left the others of their part.
+        # Generators may have moved far from the others of their part.
         jumps = 1 + np.flatnonzero(ways > JUMP * spacings[:-1])
         self.firsts = np.unique(np.concatenate([firsts, jumps]))
         self.move(points)
@@ -111,7 +112,7 @@ class PartSteps(DomainSteps):
     Attributes
     ----------
     rounds : int
-        How often cells of the latest diagram were made.
+        How often the cells of the latest diagram have been made.
     """
 
     def __init__(self, stages: TessellationStages, domain: Domain) -> None:
@@ -122,7 +123,7 @@ class PartSteps(DomainSteps):
 
     @property
     def _reads_rows(self) -> bool:
-        """Whether rows of neighbors are read: in 2D by updates and the descent of shapes."""
+        """Whether ghosts need cells: in 2D, where updates and the descent of shapes read the rows of neighbors."""
         return not self.stages.cells.from_previous
 
     def begin(self, n: int, last: bool = False, labels: cla.Array | None = None) -> None:
@@ -150,7 +151,7 @@ class PartSteps(DomainSteps):
         return Part(n, count, points, self.box, self._ghosts, labels=self._all_labels)
 
     def _begin_anew(self, x: np.ndarray, labels: cla.Array) -> None:
-        """Ask for ghosts around other generators than before."""
+        """Ask for the ghosts of new generators."""
         engine, count = self.stages.engine, self.peers.count
         lower, upper = (corner[: engine.dim].astype(float) for corner in self.box.device_corners(engine.real))
         self._labels, self._chunks = labels, Chunks(x, lower, upper)
@@ -167,7 +168,7 @@ class PartSteps(DomainSteps):
         self._boxes = self.peers.exchange([self._chunks.boxes] * self.peers.count)
 
     def _store(self) -> None:
-        """Upload the lists of ghosts, and fetch what ghosts keep: labels, and how far their balls may reach."""
+        """Upload the lists of ghosts, and get from their owners their labels and the largest radii of their balls."""
         engine, n = self.stages.engine, len(self._x)
         order = np.argsort(self._parts, kind="stable")
         self._parts, self._rows = self._parts[order], self._rows[order]
@@ -201,7 +202,7 @@ class PartSteps(DomainSteps):
         self.rounds = 0
         part = self.extend(sites, n)
         before = previous.whole or previous
-        t = None if before is None else stages.update.update(stages.cells, self.box, part.points, before, clip=None)
+        t = stages.update.update(stages.cells, self.box, part.points, before, clip=None)
         if self.peers.any(t is None) or t is None:
             return None
         part.order_rows(stages.engine, t, stages.cells.defines)
@@ -211,16 +212,16 @@ class PartSteps(DomainSteps):
         return made
 
     def finish(self, part: Part, t: Tessellation, points: cla.Array, exact: bool, nearest: bool) -> Tessellation | None:
-        """Return `t` if its cells, and in 2D those of neighbors, are final; None if there are more ghosts now."""
+        """Return `t` if its cells, and in 2D those of neighbors, are final; None if ghosts were missing."""
         if part.ghosts is None:
             return replace(t, part=part)
         engine, n = self.stages.engine, part.n_own
         assert t.reach is not None
         reach = t.reach.get().astype(float) * (2 * (1 + NOISE[engine.real.name]))
-        ghosts = np.empty(0, int)
+        ghosts, away = np.empty(0, int), np.empty((0, engine.dim))
         if self._reads_rows:
             ghosts = part.neighboring_ghosts(engine, t)
-        away = part.points.get()[ghosts].astype(float)
+            away = part.points.get()[ghosts].astype(float)
         while True:
             caps = self._caps[: part.count]
             radii = np.minimum(reach[:n], caps[:n]), np.minimum(reach[ghosts], caps[ghosts])

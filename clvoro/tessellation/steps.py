@@ -26,7 +26,7 @@ from .polyhedra import Polyhedra
 from .stages import TessellationStages
 
 LATER_FROM = 10_000
-"""Cells from which those of periodic images, if they are the larger part, are built once the halo is known."""
+"""From this number of cells on, those of periodic images, if they are the larger part, wait until the halo is known."""
 Sort: TypeAlias = Callable[[], BinnedPoints]
 """Returns the generators in bins, and sorts them when it is first called."""
 
@@ -54,7 +54,7 @@ class DomainSteps:
     def begin(self, n: int, last: bool = False, labels: cla.Array | None = None) -> None:
         """Prepare for a new diagram of `n` generators, the `last` one of a run.
 
-        In a part of a domain they have `labels` (n,), a new array for other generators.
+        In a part of a domain they have `labels` (n,). Other generators have another array.
         """
 
     def extend(self, sites: cla.Array, n: int) -> Part:
@@ -80,12 +80,14 @@ class DomainSteps:
         """Find what bounds the new cells of `part` besides its box. `previous` has the same generators."""
 
     def builds_all(self, part: Part, complete: bool, enough: bool) -> bool:
-        """Return whether ghosts of `part` get cells; those without values need them, since something cuts these.
+        """Return whether ghosts of `part` get cells, too. Ghosts without values always do: something cuts their cells.
 
         Parameters
         ----------
-        complete, enough : bool
-            The diagram is to be `complete`; its ghosts are known to be enough. Many images wait until they are.
+        complete : bool
+            Whether the diagram must be complete, with the cells of images.
+        enough : bool
+            Whether no ghosts are missing. As long as some may be, cells of many images are not built.
         """
         return part.ghosts is None or (complete and (enough or part.count < max(2 * part.n_own, LATER_FROM)))
 

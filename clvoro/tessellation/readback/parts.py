@@ -1,4 +1,4 @@
-"""Read the diagram of a part, its own cells with walls towards the others, and that of all parts from their rows."""
+"""Read the diagram of a part, with walls towards the other parts, and gather the diagram of the whole domain."""
 
 from __future__ import annotations
 
@@ -53,9 +53,11 @@ class CellRows:
 
     @classmethod
     def of(cls, t: Tessellation, labels: cla.Array) -> CellRows:
-        """Return those of `t`, whose generators have `labels` (n,)."""
+        """Return the cells of `t`, the diagram of a part whose generators have `labels` (n,)."""
         own, starts, n = labels.get()[: t.n], t.starts.get(), t.n
-        names = own if t.part is None or t.part.labels is None else t.part.labels.get()
+        assert t.part is not None
+        assert t.part.labels is not None
+        names = t.part.labels.get()
         rows = t.neighbors.get()[: starts[n]]
         faces = (
             np.where(rows < 0, rows, names[np.maximum(rows, 0)]),
@@ -80,7 +82,7 @@ class CellRows:
         return CellRows(labels[order], counts, cells, faces, int(round_off))
 
     def diagram(self, engine: Engine, domain: Domain) -> Diagram:
-        """Return the diagram of cells in the order of labels that are all of the domain."""
+        """Return the diagram of these cells, if they are all of the domain, in the order of labels."""
         neighbors, measures, centroids = self.faces
         rows = np.where(neighbors < 0, neighbors, np.searchsorted(self.labels, neighbors))
         points, volumes, offsets, covariances = (engine.upload(array, array.dtype) for array in self.cells)
