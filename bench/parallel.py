@@ -1,52 +1,57 @@
 """Runs over the ranks of MPI: bits, sizes and shapes, processor time, and what ranks exchange.
 
-    python bench/parallel.py [--ranks 1,2,4,8] [--cells 10000] [--dims 2,3] [--effort fast]
+    python bench/parallel.py [--ranks 1,2,4,8] [--cells 10000] [--dims 2,3] [--effort fast] [--device NAME]
+                             [--dtype float32] [--json]
 
-For each number of ranks the script starts itself under `mpiexec`; with PoCL each rank has one core. Diagrams are of
-random points; `bits` says whether they are those of the first number of ranks. Runs are in a box with sizes from h to
-3 h. `CPU s` is the processor time of the runs, without that of their start, summed over ranks. `exchanges` and
-`reductions` are per step: all calls of point-to-point messages, and of collective ones. `ghosts` are those of the last
-diagram over the estimate of one layer of cells around each part, 2 d (n / p)^((d - 1) / d) cells at most. `rounds`: how
-often the cells of a diagram were made, in the mean. Needs `pip install -e '.[mpi]'`.
+For each number of ranks the script starts itself under `mpiexec`; with PoCL each rank has one core. `bits` says whether
+the diagram of random points has the same bits as with the first number of ranks. The other columns are of a run in a
+box with sizes from h to 3 h. `CPU s` is the processor time of the second of two runs, summed over ranks; the first one
+builds kernels. `exchanges` and `reductions` are the rounds of messages between pairs of ranks, and of sums over all
+ranks, per step. `ghosts` is the number of ghosts of rank 0 in the last diagram over 2 d (n / p)^((d - 1) / d), an
+estimate of one layer of cells around a part. `rounds` is how often the cells of a diagram were made, in the mean: more
+than once where ghosts were missing. Needs `pip install -e '.[mpi]'`.
 """
 
 from __future__ import annotations
 
+import argparse
 import hashlib
 import json
 import os
+import shutil
 import subprocess
 import sys
 import time
 from pathlib import Path
 
 import numpy as np
-from _common import Report, counts, parser
+from _common import Report, counts, parser, shown
 
 import clvoro
 from clvoro.tessellation.part_steps import PartSteps
 
 COLUMNS = {
-    "ranks": lambda r: r["ranks"],
-    "cells": lambda r: f"{r['cells']:,}",
-    "bits": lambda r: r["bits"],
-    "mean e": lambda r: f"{r['error']:.4f}",
-    "mean Q": lambda r: f"{r['quality']:.4f}",
-    "CPU s": lambda r: f"{r['cpu']:.1f}",
-    "iterations": lambda r: f"{r['iterations']:.1f}",
-    "exchanges": lambda r: f"{r['exchanges']:.0f}",
-    "reductions": lambda r: f"{r['reductions']:.0f}",
-    "ghosts": lambda r: f"{r['ghosts']:.2f}",
-    "rounds": lambda r: f"{r['rounds']:.2f}",
+    "ranks": shown("ranks", "d"),
+    "cells": shown("cells", ",d"),
+    "bits": shown("bits", "s"),
+    "mean e": shown("error", ".4f"),
+    "mean Q": shown("quality", ".4f"),
+    "CPU s": shown("cpu", ".1f"),
+    "iterations": shown("iterations", ".1f"),
+    "exchanges": shown("exchanges", ".0f"),
+    "reductions": shown("reductions", ".0f"),
+    "ghosts": shown("ghosts", ".2f"),
+    "rounds": shown("rounds", ".2f"),
 }
 
 
-def measure_rank(dim: int, cells: int, effort: str) -> None:
+def measure_rank(options: argparse.Namespace) -> None:
     """Print the figures of all ranks as JSON, on rank 0."""
     from mpi4py import MPI
 
-    comm, box = MPI.COMM_WORLD, clvoro.Box((0,) * dim, (1,) * dim)
-    adapter, rounds, ghosts = clvoro.Adapter(comm=comm), [], [0]
+    dim, cells, effort, comm = options.rank, options.cells, options.effort, MPI.COMM_WORLD
+    box, rounds, ghosts = clvoro.Box((0,) * dim, (1,) * dim), [], [0]
+    adapter = clvoro.Adapter(clvoro.create_context(options.device), options.dtype, comm=comm)
     finish = PartSteps.finish
 
     def noted(steps, part, *given):
@@ -58,8 +63,7 @@ def measure_rank(dim: int, cells: int, effort: str) -> None:
 
     PartSteps.finish = noted
     x = np.random.default_rng(1).random((cells, dim))
-    options = {"points": x, "method": "lloyd", "max_steps": 0}
-    whole = adapter.run(box, cells ** (-1 / dim), **options).gather()
+    whole = adapter.run(box, cells ** (-1 / dim), points=x, method="lloyd", max_steps=0).gather()
     digest = hashlib.sha256()
     for name in ("neighbors", "volumes", "centroids", "face_measures") if whole is not None else ():
         digest.update(np.ascontiguousarray(getattr(whole, name)))
@@ -98,26 +102,19 @@ def main() -> None:
     p.add_argument("--cells", type=int, default=10_000, help="number of cells")
     p.add_argument("--dims", type=counts, default=[2, 3], help="dimensions")
     p.add_argument("--effort", default="fast", help="effort of the run")
-    p.add_argument("--rank", type=int, help="used by the script itself")
+    p.add_argument("--rank", type=int, help="dimension for which each rank measures; used by the script itself")
     options = p.parse_args()
     if options.rank:
-        measure_rank(options.rank, options.cells, options.effort)
+        measure_rank(options)
         return
-    mpiexec = Path(sys.executable).parent / "mpiexec"
+    mpiexec = shutil.which("mpiexec", path=Path(sys.executable).parent) or "mpiexec"
     environment = {**os.environ, "POCL_MAX_PTHREAD_COUNT": "1"}
     for dim in options.dims:
         table, first = Report(options.json, COLUMNS), ""
         for ranks in options.ranks:
-            command = [
-                str(mpiexec if mpiexec.exists() else "mpiexec"),
-                "-n",
-                str(ranks),
-                sys.executable,
-                "-W",
-                "ignore",
-            ]
-            given = ["--rank", str(dim), "--cells", str(options.cells), "--effort", options.effort]
-            found = subprocess.run([*command, __file__, *given], env=environment, stdout=subprocess.PIPE, check=True)
+            command = [mpiexec, "-n", str(ranks), sys.executable, "-W", "ignore", __file__, *sys.argv[1:]]
+            command += ["--rank", str(dim)]
+            found = subprocess.run(command, env=environment, stdout=subprocess.PIPE, check=True)
             record = json.loads(found.stdout.splitlines()[-1])
             first = first or record["digest"]
             table.add(record | {"bits": "same" if record["digest"] == first else "differ"})
