@@ -18,7 +18,7 @@ from .solid_walls.mend import NARROW, cells_of, narrow_faces, with_neighbors
 from .solid_walls.mesh import diagram_of
 
 _SMALL = 0.15
-"""Faces on a surface that are smaller than this share of h^2 are between cells that are no pair."""
+"""Smaller faces on a surface, over h^2, are between cells of different pairs."""
 _ON_EDGE, _ON_CORNER = 0.12, 0.2
 """Vertices this near to an edge or a corner of a surface, over h, lie on it."""
 _FLAT = 1e-6
@@ -33,8 +33,8 @@ _ROUNDS = 4
 def on_surfaces(diagram: Diagram, sheets: Sheets) -> Diagram:
     """Return a mesh whose faces between cells on both sides of `sheets` lie on them.
 
-    Pairs of generators are mirror images in tangent planes. On flat patches their faces are where they must be; on
-    others they are near, with narrow faces between them.
+    Pairs of generators are mirror images in tangent planes. The face between such a pair lies on the surface where that
+    is flat. Elsewhere it is near the surface, with narrow faces between cells of different pairs around it.
     """
     rows = diagram.border_faces
     if not len(rows):
@@ -55,7 +55,7 @@ def on_surfaces(diagram: Diagram, sheets: Sheets) -> Diagram:
         if not narrow.any():
             break
         made = _moved(collapse_short(made.faces, made, narrow, narrow), sheets, h)
-    # One by one, whatever faces around become, if fewer cells are rejected.
+    # Then single faces are collapsed, each if fewer cells are rejected afterwards.
     rejected, tried = _rejected(made), 0
     while len(rejected) and tried < _TRIALS:
         mesh = made.faces
@@ -75,7 +75,7 @@ def on_surfaces(diagram: Diagram, sheets: Sheets) -> Diagram:
 
 
 def _rejected(diagram: Diagram) -> np.ndarray:
-    """Return the cells at surfaces, or beside these, that OpenFOAM rejects, (k,) int."""
+    """Return the cells that OpenFOAM rejects among those with a face on a surface and their neighbors, (k,) int."""
     mesh, beside = diagram.faces, _beside(diagram)
     divided = beside[mesh.owner] | (beside[np.maximum(mesh.neighbor, 0)] & (mesh.neighbor >= 0))
     return np.flatnonzero(rejected_cells(mesh, np.flatnonzero(divided), beside))
@@ -90,7 +90,7 @@ def _without_face(mesh: Faces, row: int) -> Faces:
 
 
 def _moved(mesh: Faces, sheets: Sheets, h: np.ndarray) -> Diagram:
-    """Return the mesh with the vertices of faces on surfaces moved onto these; `h` (n,) are sizes of cells."""
+    """Return a mesh whose faces on surfaces have their vertices there; `h` (n,) are the sizes of cells."""
     rows = diagram_of(mesh).border_faces
     vertices, size = _vertices(mesh, rows, np.minimum(h[mesh.owner[rows]], h[mesh.neighbor[rows]]))
     points = mesh.points.copy()
@@ -117,15 +117,23 @@ def _faces_to_collapse(diagram: Diagram, h: np.ndarray) -> np.ndarray:
 
 
 def _with_pairs_only(mesh: Faces, rows: np.ndarray, small: np.ndarray, vertices: np.ndarray) -> Faces:
-    """Return `mesh` without the `small` ones of the faces `rows` on surfaces.
+    """Return a mesh without the small faces on surfaces, which are between cells of different pairs.
 
-    The cells that share a large face on a surface have one name, and a vertex has those of the cells that meet there,
-    and its walls. Vertices with equal names are one; so are those with four names and their neighbors with three of
-    them. A small face between two names has lost its area then.
+    Two cells that share a large face on a surface are a pair and have one number. A vertex has the numbers of the cells
+    at surfaces that meet there, and of its walls. Two ends of an edge of a small face become one vertex if they have
+    the same numbers, or if one has all the numbers of the other and four or more. Small faces then have no area.
+
+    Parameters
+    ----------
+    rows : (k,) int
+        The faces on surfaces.
+    small : (k,) bool
+    vertices : (v,) int
+        The corners of these faces.
     """
     n = mesh.n_cells
     pairs = np.stack([mesh.owner[rows[~small]], mesh.neighbor[rows[~small]]], axis=1)
-    name = connect(n, pairs)[1]
+    number = connect(n, pairs)[1]
     on_border = np.zeros(n, bool)
     on_border[mesh.owner[rows]] = on_border[mesh.neighbor[rows]] = True
     place = np.full(len(mesh.points), -1)
@@ -134,18 +142,17 @@ def _with_pairs_only(mesh: Faces, rows: np.ndarray, small: np.ndarray, vertices:
     face = np.repeat(np.arange(len(mesh)), np.diff(mesh.starts))
     at, face = at[at >= 0], face[at >= 0]
     other = mesh.neighbor[face]
-    both = [np.stack([at, name[mesh.owner[face]]], axis=1)[on_border[mesh.owner[face]]]]
+    both = [np.stack([at, number[mesh.owner[face]]], axis=1)[on_border[mesh.owner[face]]]]
     inner = (other >= 0) & on_border[np.maximum(other, 0)]
-    both += [np.stack([at, name[np.maximum(other, 0)]], axis=1)[inner], np.stack([at, other], axis=1)[other < 0]]
+    both += [np.stack([at, number[np.maximum(other, 0)]], axis=1)[inner], np.stack([at, other], axis=1)[other < 0]]
     found = np.unique(np.concatenate(both), axis=0)
     starts = np.searchsorted(found[:, 0], np.arange(len(vertices) + 1))
-    names = [tuple(found[starts[k] : starts[k + 1], 1].tolist()) for k in range(len(vertices))]
-    # Sides of small faces: those whose ends have the same names, or more.
+    numbers = [tuple(found[starts[k] : starts[k + 1], 1].tolist()) for k in range(len(vertices))]
     starts, corners = take_rows(mesh.starts, mesh.corners, rows[small])
     begin, end = place[corners], place[corners[following(starts)]]
     joined = []
     for i, j in zip(begin.tolist(), end.tolist(), strict=True):
-        one, two = names[i], names[j]
+        one, two = numbers[i], numbers[j]
         if one == two or (max(len(one), len(two)) > 3 and (set(one) <= set(two) or set(two) <= set(one))):
             joined.append((i, j))
     group = connect(len(vertices), np.array(joined, int).reshape(-1, 2))[1]
@@ -210,13 +217,9 @@ def _onto(mesh: Faces, sheets: Sheets, vertices: np.ndarray, size: np.ndarray) -
     corner, edge = sheets.nearest_corner(x, _ON_CORNER * size), sheets.nearest_on_edges(x, _ON_EDGE * size)
     moved = np.where(np.isfinite(edge), edge, sheets.nearest(x))
     moved = np.where(np.isfinite(corner) & ~at_wall[:, None], corner, moved)
-    for _ in range(_ROUNDS if len(place) else 0):
-        for w in distinct(wall).tolist():
-            some = place[wall == w]
-            normals, gaps = mesh.domain.toward_walls(np.full(len(some), w), moved[some])
-            moved[some] += gaps[:, None] * normals
-        moved[at_wall] = sheets.nearest(moved[at_wall])
-    if len(place):
+    for k in range(_ROUNDS + 1 if len(place) else 0):
+        if k:
+            moved[at_wall] = sheets.nearest(moved[at_wall])
         for w in distinct(wall).tolist():
             some = place[wall == w]
             normals, gaps = mesh.domain.toward_walls(np.full(len(some), w), moved[some])

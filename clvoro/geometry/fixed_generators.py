@@ -58,7 +58,7 @@ class FixedGenerators:
         return len(self.points)
 
     def with_others(self, others: FixedGenerators | None, room: Callable[[np.ndarray], np.ndarray]) -> FixedGenerators:
-        """Return these and `others`, without those of them that are within room(points) of these."""
+        """Return these and those of `others` that are farther than room(points) from all of these."""
         if others is None or not len(others):
             return self
         away = scipy.spatial.KDTree(self.points).query(others.points)[0]

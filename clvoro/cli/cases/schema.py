@@ -504,7 +504,7 @@ Line = RingCurve | Annotated[list[Plane], Meta(min_length=2)]
 
 
 class SurfaceTable(Table):
-    """A surface inside, from a file."""
+    """A file of a surface inside a domain, its unit of length, and the name of the surface."""
 
     file: Text
     units: Text | Positive | None = None
@@ -512,7 +512,7 @@ class SurfaceTable(Table):
 
 
 def _with_surfaces(domain: Any, surfaces: Text | list[SurfaceTable] | None, folder: Path) -> Any:
-    """Return `domain` with the surfaces of a table: a file, or a list of files with names."""
+    """Return `domain` with surfaces inside: those of one file, or of a list of files with units and names."""
     if surfaces is None:
         return domain
     if isinstance(surfaces, str):

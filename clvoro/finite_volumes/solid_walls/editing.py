@@ -18,7 +18,7 @@ from ..gate import LEAST_DETERMINANT, LEAST_MEASURE
 _MOST_FACES = 200
 """A cell with more faces is the one that `NearWalls` has in place of all cells far from walls; it is not judged."""
 _ROUNDING = 1e-9
-"""Places closer than this, over the extent of the mesh, are the same."""
+"""Vertices of two meshes at the same place differ by at most this share of the extent of the mesh."""
 Face = tuple[int, int, tuple[int, ...]]
 """Owner, neighbor and corners; see `Faces`."""
 Edge = tuple[int, int]

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple
 
@@ -41,9 +40,10 @@ _CANDIDATES = 16  # points among which each one of the first sample is chosen
 _SPACINGS = 0.9, 0.84, 0.78  # over h: least distances in the first sample
 _AROUND = 12  # neighbors among the points with which distances from generators are compared
 _MEET = 0.2  # of h: points of the sample whose distances differ by less meet at a place
-_STEPS_OF_PLACES, _MOST_STEP, _LEAST = 4, 0.15, 1e-9  # of Newton's method for these; how far each goes, over h
-_SURE, _FARTHEST = 0.98, 0.2  # places stay if the distance from generators becomes less, or they move farther, over h
-_MEETING = 4  # points of the sample that know of a ball
+_STEPS_OF_PLACES, _MOST_STEP, _LEAST = 4, 0.15, 1e-9  # Newton's method for these: steps, longest step over h, damping
+# A place moves back if its distance to generators shrinks below this share, or if it moves farther than this, over h.
+_SURE, _FARTHEST = 0.98, 0.2
+_MEETING = 4  # nearest points of the sample, of which those whose cells meet at a place are chosen
 _STEPS = 60  # of Lloyd's method
 _SETTLE, _SHARE = 40, 0.5  # in the first steps only this share of the points is taken
 _OVER = 1.5  # how far it goes, over the way to the centroids
@@ -56,21 +56,8 @@ _STRAIGHT = 0.55  # of the height of a generator: least distance from surfaces
 _ROUNDS = 40
 
 
-@dataclass(frozen=True)
-class SurfacePairs(FixedGenerators):
-    """The generators beside surfaces. Balls are around places on the surfaces.
-
-    Attributes
-    ----------
-    feet : (c, 3) float64
-        Points of the surfaces, one for each pair.
-    """
-
-    feet: np.ndarray
-
-
-def place_pairs(sheets: Sheets, domain: Domain, size: Callable[[np.ndarray], np.ndarray]) -> SurfacePairs:
-    """Return the generators beside `sheets` in `domain` for the sizes h = size(points (n, 3)).
+def place_pairs(sheets: Sheets, domain: Domain, size: Callable[[np.ndarray], np.ndarray]) -> FixedGenerators:
+    """Return the generators beside `sheets` in `domain`, where cells have the sizes h = size(points (n, 3)).
 
     Raises
     ------
@@ -458,15 +445,14 @@ class _Sample:
                 for g in self.generators[s]:
                     self.balls[g].append(ball)
 
-    def pairs(self) -> SurfacePairs:
-        return SurfacePairs(
+    def pairs(self) -> FixedGenerators:
+        return FixedGenerators(
             np.array(self.points),
             np.array(self.centers).reshape(-1, 3),
             np.array(self.radii),
             np.cumsum([0, *map(len, self.balls)]).astype(np.int32),
             np.array([ball for balls in self.balls for ball in balls], np.int32),
             np.empty((0, 3)),
-            self.q,
         )
 
 

@@ -17,10 +17,11 @@ from ...errors import InputError, InputTypeError
 from ..borders import Borders, Size
 from ..columns import Columns
 from ..domain import Domain
+from ..fixed_generators import FixedGenerators
 from ..solid.solid import Solid, pack_array, unpack_array
 from ..surface import Surface
 from ..surface_files import SOLIDS, FilePart, parts_of, read_parts, word
-from .pairs import SurfacePairs, place_pairs
+from .pairs import place_pairs
 from .sheets import Sheets
 
 if TYPE_CHECKING:
@@ -33,7 +34,7 @@ _EXPECTED = (
 _FLAT = 1 - 1e-9
 """Least cosine between the normals of a flat patch."""
 _SMALL = 1e-3
-"""Smaller faces, over the 2/3 power of volumes, do not join two cells to one region."""
+"""Faces smaller than this, over the 2/3 power of the smaller cell's volume, do not connect regions."""
 
 
 class Surfaces(Borders):
@@ -150,7 +151,7 @@ class Surfaces(Borders):
                 found[:, k] = columns.winding(points) != 0
         return found
 
-    def place(self, domain: Domain, free: Domain, size: Size) -> SurfacePairs:
+    def place(self, domain: Domain, free: Domain, size: Size) -> FixedGenerators:
         """Return the generators beside the surfaces.
 
         Raises
@@ -186,7 +187,7 @@ class Surfaces(Borders):
         return np.flatnonzero(differ)
 
     def region_of_cells(self, diagram: Diagram) -> np.ndarray:
-        """Return the region of each cell, (n,) int32: cells that are connected without a face on a surface."""
+        """Return the region of each cell, (n,) int32: a region is connected by faces that are not on surfaces."""
         f, n = diagram.faces, len(diagram)
         joins = np.ones(f.n_inner, bool)
         joins[diagram.border_faces] = False
@@ -201,7 +202,7 @@ class Surfaces(Borders):
         return rank[label]
 
     def region_names(self, diagram: Diagram) -> list[str]:
-        """Return the names of the regions: those of the smallest closed surfaces that hold them and have a name."""
+        """Return the names of the regions: each has that of the smallest closed surface with a name around it."""
         region = diagram.cell_region
         first = np.unique(region, return_index=True)[1]
         bits = self.inside(diagram.points[first])
