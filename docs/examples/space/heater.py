@@ -21,12 +21,12 @@ volumes = np.bincount(d.cell_region, d.volumes)
 print({name: round(float(v), 4) for name, v in zip(d.region_names, volumes, strict=True)}, "heater:", heater.measure)
 
 # %%
-# Half of the room. Faces lie on the surfaces, and on no side of them is a cell cut.
+# Half of the room. Faces lie on the surfaces: each cell is on one side of them.
 
 mesh.plot(d.cell_region, view="cutaway", cut="y", through=(0.5, 0.5, 0.5))
 
 # %%
-# OpenFOAM gets a zone of cells for each region, so that `splitMeshRegions -cellZones` makes meshes for conjugate heat
-# transfer of it, and a zone of faces for each surface.
+# In OpenFOAM each region is a zone of cells, and each surface a zone of faces. `splitMeshRegions -cellZones` then makes
+# the meshes of the regions for conjugate heat transfer.
 
 mesh.save("room/constant/polyMesh")
