@@ -105,12 +105,25 @@ def _collapsed_polygons(mesh: Faces, diagram: Diagram, parts: np.ndarray, collap
 
 def _collapsed_polyhedra(mesh: Faces, diagram: Diagram, parts: np.ndarray, collapse: bool) -> Faces:
     from .collapse import collapse_short
+    from .solid_walls.mend import spoiled_near_walls, with_neighbors
 
     del parts
     mesh = replace(mesh, corners=mesh.corners.astype(np.int32, copy=False))
     # What short edges may become depends on the sides of a box; those of layers are wanted.
     whole = mesh.domain.uncut is mesh.domain and mesh.layer is None
-    return collapse_short(mesh, diagram) if collapse and whole else mesh.compact()
+    if not collapse or not whole:
+        return mesh.compact()
+    made = collapse_short(mesh, diagram)
+    if diagram.faces.diagram is not None:  # its cells are convex
+        return made
+    held = np.zeros(mesh.n_cells, bool)
+    for _ in range(_ROUNDS):
+        rejected = spoiled_near_walls(mesh, made) & ~held
+        if not rejected.any():
+            break
+        held |= with_neighbors(mesh, rejected)
+        made = collapse_short(mesh, diagram, chosen=~(held[mesh.owner] | held[np.maximum(mesh.neighbor, 0)]))
+    return made
 
 
 _COLLAPSED = {2: _collapsed_polygons, 3: _collapsed_polyhedra}

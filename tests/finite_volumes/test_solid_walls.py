@@ -10,6 +10,7 @@ from scipy.spatial import ConvexHull
 
 import clvoro
 from clvoro.errors import InputError
+from clvoro.finite_volumes.solid_walls import mend
 from clvoro.finite_volumes.solid_walls.cures import Cures
 from clvoro.finite_volumes.solid_walls.editing import judge
 from clvoro.finite_volumes.solid_walls.mesh import (
@@ -82,6 +83,33 @@ def sides_of_cells(faces):
         np.concatenate([here, after[inner]]),
         np.concatenate([after, here[inner]]),
     )
+
+
+def test_cells_that_a_collapse_would_spoil_stay_as_they_are(made, monkeypatch):
+    _, faces = made
+    calls = []
+
+    def spoiled(before, made):
+        """Reject all changed cells at first, then none."""
+        calls.append(mend.changed_cells(before, made))
+        return calls[0] if len(calls) == 1 else np.zeros(before.n_cells, bool)
+
+    monkeypatch.setattr(mend, "spoiled_near_walls", spoiled)
+    diagram_of(faces).solver_mesh()
+    first, *others = calls
+    assert len(others) == first.any()
+    assert not any((first & changed).any() for changed in others)
+
+
+def test_a_cell_with_a_vertex_beyond_its_other_side_is_spoiled(made):
+    _, faces = made
+    assert not mend.spoiled_near_walls(faces, faces).any()
+    cell = int(faces.owner[-1])
+    points = faces.points.copy()
+    mine = np.flatnonzero((faces.owner == cell) | (faces.neighbor == cell))
+    vertex = faces.corners[faces.starts[mine[0]]]
+    points[vertex] += 3 * (faces.generators[cell] - points[vertex])
+    assert mend.spoiled_near_walls(faces, replace(faces, points=points))[cell]
 
 
 def test_cells_are_closed(made):

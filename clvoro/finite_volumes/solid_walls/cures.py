@@ -62,11 +62,11 @@ class Cures:
     surface : WallSurface
     faces : Faces
     names : (n,) int
-        Of the cells, for other meshes of them.
+        Generators of the cells: cells of two meshes may be the same if their names are.
     sizes : (n,) float
         h of the cells.
     earlier : Cures, optional
-        Of a mesh that has many of the cells, too. What has been found for these is taken over.
+        Those of an earlier mesh. In cells that both meshes share they are repeated.
 
     Attributes
     ----------
@@ -87,7 +87,7 @@ class Cures:
             self._take_over(earlier)
 
     def _take_over(self, earlier: Cures) -> None:
-        """Make the changes of earlier cures, and pass over cells where none helped, where the cells are the same."""
+        """Repeat earlier cures in cells that both meshes share, and note in which of these no cure helped."""
         old = earlier.edits
         matches = Matches(old, earlier.names, self.edits, self.names)
         cells = self.edits.repeat(old, matches)
@@ -453,11 +453,10 @@ def cured(
     rejected: np.ndarray,
     earlier: Cures | None,
 ) -> tuple[Faces, np.ndarray, np.ndarray, np.ndarray, Cures | None]:
-    """Return the mesh with its `rejected` cells (k,) cured where that works; the cell that each was.
+    """Return the mesh with its `rejected` cells (k,) cured where that works, and the cell that each was.
 
-    Then follow `own` and rejected cells, as in `_Made`, and the cures. The mesh comes back as it is if in the end more
-    of its cells would be rejected than before. `earlier` cures are those of another mesh
-    of these cells, with other walls.
+    Then follow `own` and rejected cells, as in `_Made`, and the cures. The mesh stays as it is if cures would leave
+    more cells rejected. `earlier` cures are those of an earlier mesh of the solid; see `Cures`.
     """
     if len(rejected) > _TOO_MANY * faces.n_cells:
         return faces, np.arange(faces.n_cells), own, rejected, None

@@ -152,9 +152,9 @@ class CellCut:
         return found
 
     def _divide(self, k: int, i: int, j: int) -> list[int] | None:
-        """Divide a face from vertex i to vertex j of the section; return what vertices this has between them, or None.
+        """Divide a face along the section, from its vertex i to j; return the vertices of the section between these.
 
-        A face whose upper part is in the plane stays whole: the section follows its sides.
+        A face whose upper part is in the plane stays whole: the section follows its sides. None: the cut fails.
         """
         edits, loop, after = self.edits, self.edits.seen(k, self.cell), list[int]()
         if k in self.parts or i not in loop or j not in loop:

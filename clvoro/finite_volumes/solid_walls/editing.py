@@ -16,7 +16,7 @@ from ...mesh.faces import Faces
 from ..gate import LEAST_DETERMINANT, LEAST_MEASURE
 
 _MOST_FACES = 200
-"""A cell with more faces is the one that `NearWalls` has in place of all cells far from walls; it is not judged."""
+"""A cell with more faces than this is no real one. It stands for all cells far from walls; see `NearWalls`."""
 _ROUNDING = 1e-9
 """Vertices of two meshes at the same place differ by at most this share of the extent of the mesh."""
 Face = tuple[int, int, tuple[int, ...]]
@@ -253,7 +253,7 @@ class Edits:
         return len(faces) > 3 and all((b, a) in seen for a, b in seen)
 
     def repeat(self, other: Edits, matches: Matches) -> dict[int, int]:
-        """Take the trials again that other edits have taken, where both meshes have the same cells.
+        """Repeat the changes that other edits have made to their mesh, in the cells that both meshes share.
 
         Parameters
         ----------

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from ...mesh.connectivity import take_rows
 from ...mesh.faces import Faces
 from ..defects import DefectLimits
 from ..gate import rejected_cells
@@ -42,6 +43,34 @@ def rejected_at_walls(faces: Faces, judged: np.ndarray) -> np.ndarray:
     doubtful = at_wall[cells]
     tested = np.flatnonzero(doubtful[part.owner] | (doubtful[np.maximum(part.neighbor, 0)] & (part.neighbor >= 0)))
     return cells[rejected_cells(part, tested, judged[cells])]
+
+
+def spoiled_near_walls(before: Faces, made: Faces) -> np.ndarray:
+    """Return which cells near walls OpenFOAM rejects after a collapse that has changed them, (n,) bool.
+
+    Such cells may have small defects before. A collapse may exchange these for others.
+    """
+    judged = changed_cells(before, made) & with_neighbors(before, touching_walls(before))
+    kept = with_neighbors(made, judged)
+    cells, part = np.flatnonzero(kept), made.part(kept)[0]
+    mine = judged[cells]
+    tested = np.flatnonzero(mine[part.owner] | (mine[np.maximum(part.neighbor, 0)] & (part.neighbor >= 0)))
+    found = np.zeros(len(kept), bool)
+    found[cells] = rejected_cells(part, tested, mine)
+    return found
+
+
+def changed_cells(before: Faces, made: Faces) -> np.ndarray:
+    """Return which cells of a mesh have been changed by `collapse_short`, (n,) bool."""
+    row = np.full(before.half_face.max() + 1, -1)
+    row[before.half_face] = np.arange(len(before))
+    rows = row[made.half_face]
+    changed = np.diff(made.starts) != np.diff(before.starts)[rows]
+    kept = np.flatnonzero(~changed)
+    starts, corners = take_rows(made.starts, made.corners, kept)
+    same = made.points[corners] == before.points[take_rows(before.starts, before.corners, rows[kept])[1]]
+    changed[kept] = ~np.logical_and.reduceat(same.all(axis=1), starts[:-1])
+    return cells_of(made, changed)
 
 
 def touching_walls(faces: Faces) -> np.ndarray:

@@ -17,7 +17,7 @@ from ...mesh.faces import Faces
 from ..collapse import collapse_short
 from .chains import Crossings, cross_cells
 from .cures import Cures, cured
-from .mend import cells_of, narrow_faces, rejected_at_walls, touching_walls, with_neighbors
+from .mend import changed_cells, narrow_faces, rejected_at_walls, touching_walls, with_neighbors
 from .near_walls import NearWalls
 from .pierce import IN, WALL, pierce_edges, sides, simplified
 from .polygons import Divider, chain_loops, open_sides
@@ -337,13 +337,8 @@ def _collapsed(faces: Faces, sizes: np.ndarray, among: np.ndarray | None = None)
     made = collapse_short(diagram.faces, diagram, narrow_faces(diagram.faces, sizes, at_wall), chosen)
     row = np.full(len(diagram.neighbors), -1)
     row[diagram.faces.half_face] = np.arange(len(faces))
-    before = row[made.half_face]
-    changed = np.diff(made.starts) != np.diff(faces.starts)[before]
-    kept = np.flatnonzero(~changed)
-    starts, corners = take_rows(made.starts, made.corners, kept)
-    same = made.points[corners] == faces.points[take_rows(faces.starts, faces.corners, before[kept])[1]]
-    changed[kept] = ~np.logical_and.reduceat(same.all(axis=1), starts[:-1])
-    return replace(made, half_face=faces.half_face[before]), cells_of(made, changed)
+    changed = changed_cells(diagram.faces, made)
+    return replace(made, half_face=faces.half_face[row[made.half_face]]), changed
 
 
 def _simplify(walls: np.ndarray, near: NearWalls, rejected: np.ndarray) -> None:
