@@ -1013,7 +1013,7 @@ TESTED_IN = {
     "; use fewer layers": "finite_volumes/test_prism_layers.py::test_wrong_layers_are_refused",
     "expected a communicator of mpi4py": "adaptation/test_ranks.py::test_what_ranks_cannot_share_is_refused",
     "since ranks share the run": "adaptation/test_ranks.py::test_what_ranks_cannot_share_is_refused",
-    "has other input than rank 0": "adaptation/test_ranks.py::test_parts_with_other_input_are_refused",
+    "as rank 0 has; give all ranks": "adaptation/test_ranks.py::test_parts_with_other_input_are_refused",
     "surfaces are in space": "adaptation/test_surfaces.py::test_what_is_refused_at_the_door",
     "cross or cover each other": "adaptation/test_surfaces.py::test_what_is_refused_at_the_door",
     "surfaces are outside of ": "adaptation/test_surfaces.py::test_what_is_refused_at_the_door",

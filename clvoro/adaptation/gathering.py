@@ -46,7 +46,7 @@ class ResultParts:
 
     def together(self, work: Callable[[], None]) -> None:
         """Call `work` in all parts. An error in one of them is raised in all."""
-        self.engine.peers.agree(work, lambda _: "")
+        self.engine.peers.agree(work)
 
     def gather(self, result: Result) -> Result | None:
         """Return the whole mesh on part 0, and None on the others."""

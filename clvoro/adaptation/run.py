@@ -160,7 +160,10 @@ class Run:
         used = None if given is not None and given.replaced else points
         prepared = stages.engine.peers.agree(
             lambda: prepare(stages, self._domain, size, used, options, max_levels, self._fixed),
-            lambda made: f"{self._domain!r} {options} {made.required!r} {made.target} {made.levels}",
+            lambda made: {
+                **run_fingerprint(self._domain, vars(options), stages.engine.real, used, self._fixed),
+                **{"cells": made.target, "levels": made.levels, "cells for the size field": made.required},
+            },
         )
         if hasattr(self, "state"):
             stages.release()  # memory of the mesh that the run has had

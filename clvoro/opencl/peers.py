@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import numpy as np
@@ -72,38 +73,44 @@ class Peers:
         found = self.exchange([values if part == 0 else values[:0] for part in range(self.count)])
         return found if self.number == 0 else []
 
-    def agree(self, prepare: Callable[[], Made], describe: Callable[[Made], str]) -> Made:
-        """Call `prepare` in all parts, and return what it returns, if `describe` gives the same text in all of them.
+    def agree(
+        self, prepare: Callable[[], Made], describe: Callable[[Made], Mapping[str, object]] = lambda _: {}
+    ) -> Made:
+        """Call `prepare` in all parts, and return what it returns, if `describe` gives the same values in all of them.
+
+        The version of clvoro counts, too.
 
         Raises
         ------
         InputError
-            If texts differ.
+            On part 0, if values differ: names the first one.
         RankError
-            If `prepare` raises an error in another part.
+            On the others; or if `prepare` raises an error in another part.
         """
+        from .. import __version__
+
         if self.count == 1:
             return prepare()
-        error, made, text = None, None, ""
+        error, made, told = None, None, {"version": __version__}
         try:
             made = prepare()
-            text = describe(made)
+            told |= {name: str(value) for name, value in describe(made).items()}
         except Exception as caught:
-            error, text = caught, f"\0{type(caught).__name__}: {caught}"
-        found = [
-            sent.tobytes().decode() for sent in self.exchange([np.frombuffer(text.encode(), np.uint8)] * self.count)
-        ]
+            error, told["error"] = caught, f"{type(caught).__name__}: {caught}"
+        text = np.frombuffer(json.dumps(told).encode(), np.uint8)
+        found = [json.loads(sent.tobytes()) for sent in self.exchange([text] * self.count)]
         if error is not None:
             raise error
         for number, other in enumerate(found):
-            if other.startswith("\0"):
-                raise RankError(f"rank {number} of {self.count} has failed: {other[1:]}")
-        differ = [number for number, other in enumerate(found) if other != found[0]]
-        if differ:
-            raise InputError(
-                f"rank {differ[0]} has other input than rank 0, or another version of clvoro: {found[differ[0]]:.300}, "
-                f"expected {found[0]:.300}; give all ranks the same arguments"
-            )
+            if "error" in other:
+                raise RankError(f"rank {number} of {self.count} has failed: {other['error']}")
+        for number, other in enumerate(found):
+            for name in {**found[0], **other}:
+                if (expected := found[0].get(name)) != (value := other.get(name)):
+                    raise (RankError if self.number else InputError)(
+                        f"rank {number} of {self.count} has {name} = {value!s:.200}, expected {expected!s:.200}, as "
+                        "rank 0 has; give all ranks the same arguments and the same version of clvoro"
+                    )
         return cast("Made", made)
 
     def fail(self, error: BaseException) -> None:

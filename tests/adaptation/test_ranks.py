@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import clvoro
-from clvoro.errors import InputError, InputTypeError
+from clvoro.errors import InputError, InputTypeError, RankError
 from clvoro.opencl.peers import Peers
 from tests.reference.peers import run_parts
 
@@ -126,14 +126,18 @@ def test_what_ranks_cannot_share_is_refused(ctx, change):
         adapter.start(clvoro.Box((0, 0), (1, 1)), 0.2)
 
 
-def test_parts_with_other_input_are_refused(ctx):
+@pytest.mark.parametrize(
+    ("name", "told"), [("seed", "seed = 1, expected 0"), ("points", "points = "), ("size", "cells")]
+)
+def test_parts_with_other_input_are_refused(ctx, name, told):
     def work(peers):
-        adapter = clvoro.Adapter(ctx)
+        adapter, errors = clvoro.Adapter(ctx), InputError if peers.number == 0 else RankError
         adapter._peers = peers
-        adapter.run(clvoro.Box((0, 0), (1, 1)), 0.2 - 0.1 * peers.number)
+        changed = {"seed": peers.number, "points": [(0.5, 0.2 + 0.1 * peers.number)], "size": 0.2 - 0.1 * peers.number}
+        with pytest.raises(errors, match=f"rank 1 of 2 has {told}"):
+            adapter.run(clvoro.Box((0, 0), (1, 1)), **{"size": 0.2, name: changed[name]})
 
-    with pytest.raises(InputError, match="rank 1 has other input than rank 0"):
-        run_parts(2, work)
+    run_parts(2, work)
 
 
 @pytest.mark.skipif(importlib.util.find_spec("mpi4py") is None, reason="mpi4py is not installed")
