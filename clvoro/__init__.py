@@ -41,8 +41,7 @@ from .mesh.results import Displacements, Result, Transported
 from .opencl import profile
 from .opencl.devices import create_context, list_devices
 from .shared import adapt, power_diagram, transport, voronoi
-
-__version__ = "0.2.0"
+from .version import __version__ as __version__
 
 __all__ = [
     "Adapter",

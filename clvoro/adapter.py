@@ -112,7 +112,7 @@ class Adapter:
         if real == np.float64:
             device.require_fp64(self.ctx)
         self.queue = cl.CommandQueue(self.ctx)
-        self._peers = ALONE if comm is None else Ranks(comm)
+        self._peers = ALONE if comm is None else comm if isinstance(comm, Peers) else Ranks(comm)
         self._stages: dict[tuple[int, tuple[str, ...], bool], Stages] = {}
         self._busy = threading.Lock()
         self._owner: int | None = None

@@ -21,6 +21,7 @@ HOUSE = PACKAGE.parent
 CLANG_FORMAT = "14"
 """The version whose style is the kernels': others break some lines elsewhere."""
 ORDER = (
+    "version",
     "errors",
     "arguments",
     "files",

@@ -7,16 +7,21 @@ from __future__ import annotations
 
 import argparse
 import math
+import os
 import sys
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, nullcontext, redirect_stderr, redirect_stdout
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import Aborted, BuildError, ClvoroError, DeviceError, InputError, InputTypeError, OutputError
+from ..opencl.peers import ALONE
+from ..version import __version__
 from .outputs import MESH_FILES, NAMES
 from .progress import steady_streams
+from .ranks import end_together, may_speak, this_rank
 
 if TYPE_CHECKING:
     from ..geometry.boundary_layers import Layers
@@ -42,6 +47,7 @@ examples:
   clvoro run my.toml --effort fast --out result --format openfoam
   clvoro run my.toml --checkpoint my.state                   and, after a crash,
   clvoro run my.toml --checkpoint my.state --resume my.state
+  mpiexec -n 4 clvoro run my.toml       over 4 ranks of MPI, a device for each
   clvoro convert result/mesh.npz mesh.nc
   clvoro check result/mesh.vtu          verify the mesh
   clvoro check --for openfoam result/mesh.vtu
@@ -59,7 +65,7 @@ def build_parser() -> argparse.ArgumentParser:
         epilog=_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("--version", action="version", version=f"clvoro {_version()}")
+    parser.add_argument("--version", action="version", version=f"clvoro {__version__}")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
     _add_run(commands)
     _add_convert(commands)
@@ -134,6 +140,12 @@ def _add_output(run: Any) -> None:
         type=_mesh_formats,
         default=(),
         help=f"further mesh files, such as openfoam,nc: {', '.join(MESH_FILES)}",
+    )
+    run.add_argument(
+        "--pieces",
+        action="store_true",
+        help="under mpiexec: each rank writes its own cells, mesh.pvtu in place of mesh.vtu and mesh.npz, a decomposed "
+        "case for openfoam, and no report; no rank holds the whole mesh",
     )
     _add_types(run)
     _add_walls(run)
@@ -344,25 +356,51 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _carry_out(argv: Sequence[str] | None) -> int:
     """Run one command; turn errors into a message and an exit code."""
+    peers, speaks, shares = ALONE, may_speak(), False
     try:
-        arguments = build_parser().parse_args(argv)
+        with nullcontext() if speaks else _silence():
+            arguments = build_parser().parse_args(argv)
         arguments.given = sys.argv[1:] if argv is None else argv
-        with warnings.catch_warnings():
+        shares = arguments.work is _run
+        if shares:
+            arguments.peers = peers = this_rank()
+        with warnings.catch_warnings(), nullcontext() if peers.number == 0 else _silence():
             warnings.showwarning = _warning_printer()
             return arguments.work(arguments)
-    except (OutputError, BuildError) as error:
-        return _complain(error, FAILED)
-    except (InputError, InputTypeError) as error:
-        return _complain(error, BAD_INPUT)
-    except DeviceError as error:
-        return _complain(error, NO_DEVICE)
-    except (ClvoroError, OSError) as error:
-        return _complain(error, FAILED)
-    except MemoryError as error:
-        remedy = "give the process more, or ask for fewer cells"
-        return _complain(f"the host is out of memory ({error}); {remedy}", FAILED)
-    except (KeyboardInterrupt, Aborted):
-        return _complain("interrupted, nothing more has been written", INTERRUPTED)
+    except (Exception, KeyboardInterrupt, Aborted) as error:
+        peers.fail(error)
+        message, code = _explain(error)
+        if shares and peers.count == 1 and not speaks:
+            return code
+        return end_together(peers, code, lambda: _complain(message, code))
+
+
+@contextmanager
+def _silence() -> Iterator[None]:
+    """Discard what is printed: another rank says the same."""
+    with open(os.devnull, "w", encoding="utf-8") as nowhere, redirect_stdout(nowhere), redirect_stderr(nowhere):
+        yield
+
+
+def _explain(error: BaseException) -> tuple[object, int]:
+    """Return what to print about `error`, and the exit code; raise it if it is an error in clvoro itself."""
+    if isinstance(error, KeyboardInterrupt | Aborted):
+        return "interrupted, nothing more has been written", INTERRUPTED
+    if isinstance(error, MemoryError) and not isinstance(error, ClvoroError):
+        return f"the host is out of memory ({error}); give the process more, or ask for fewer cells", FAILED
+    for kinds, code in _CODES:
+        if isinstance(error, kinds):
+            return error, code
+    raise error
+
+
+_CODES: tuple[tuple[tuple[type[BaseException], ...], int], ...] = (
+    ((OutputError, BuildError), FAILED),
+    ((InputError, InputTypeError), BAD_INPUT),
+    ((DeviceError,), NO_DEVICE),
+    ((ClvoroError, OSError), FAILED),
+)
+"""Exit codes by the kind of an error; the first one that fits counts."""
 
 
 def _warning_printer() -> Callable[..., None]:
@@ -383,19 +421,14 @@ def _complain(message: object, code: int) -> int:
     return code
 
 
-def _version() -> str:
-    from .. import __version__
-
-    return __version__
-
-
 def _run(arguments: argparse.Namespace) -> int:
     from .cases import load_case
     from .jobs import Job
     from .progress import during
 
     work = f"{Path(arguments.case).stem}: preparing the domain"
-    case = during(work, arguments.quiet, lambda: load_case(arguments.case))
+    read = partial(during, work, arguments.quiet, lambda: load_case(arguments.case))
+    case = arguments.peers.agree(read, lambda case: {"case": case.text()})
     methods = [] if arguments.method is None else arguments.method.split(",")
     case = case.with_run(
         method=methods[0] if len(methods) == 1 else None,
@@ -428,6 +461,8 @@ def _run(arguments: argparse.Namespace) -> int:
         unchecked=arguments.unchecked,
         command=tuple(arguments.given),
         solver=arguments.check_solver,
+        peers=arguments.peers,
+        pieces=arguments.pieces,
     )
     if job.run():
         return INTERRUPTED

@@ -29,8 +29,10 @@ from ..io.check_mesh import run_check_mesh
 from ..io.foam import PatchType, patch_types
 from ..mesh.results import Result, boundary_line, summary, thickness_in_words
 from ..opencl.memory_limits import available_memory, in_bytes
+from ..opencl.peers import ALONE, Peers
 from ..opencl.profile import Profile
 from ..opencl.program import build_seconds
+from ..version import __version__
 from .cases import Case
 from .outputs import MESH_FILES, PLANE, check_folder, do_all, refuse_own_files, require_plots
 from .progress import ProgressDisplay, during
@@ -83,6 +85,10 @@ class Job:
         Write a mesh for OpenFOAM even if its checkMesh rejects it.
     solver : "openfoam" or None
         Check the mesh by the criteria of this solver, and with its own program if that is installed.
+    peers : Peers
+        The ranks of `mpiexec` that share the run: all of them have the same job. Rank 0 gathers the mesh and writes.
+    pieces : bool
+        Each rank writes its own cells instead.
     """
 
     case: Case
@@ -102,6 +108,8 @@ class Job:
     unchecked: bool = False
     solver: Solver | None = None
     command: tuple[str, ...] = ()
+    peers: Peers = ALONE
+    pieces: bool = False
     interrupted: bool = field(default=False, init=False)
     rejected: bool = field(default=False, init=False)
     missed: bool = field(default=False, init=False)
@@ -116,28 +124,11 @@ class Job:
         OSError
             If the output cannot be written.
         """
-        from .. import Adapter, create_context
-
-        arguments = self.case.run_arguments()
-        size = self._during("preparing the size field", self.case.size_field)
-        warn_of_unused(self.case.run, [m or Options.method for m in self.case.methods])
-        self._refuse_formats()
-        self._land = self.case.land
-        self.case = self.case.with_patches(self.types)
-        patch_types(self.case.domain.boundary_names, self.case.patches)
-        files = self._checkpoints()
-        named = {"checkpoint": self.checkpoint, "resume": self.resume}
-        named |= {source.name: source for source in self.case.sources()}
-        refuse_own_files(self.out, named)
-        check_folder(self.out)
-        if files is not None and self.checkpoint is None and self.resume is None:
-            (self.out / STATE).unlink(missing_ok=True)  # of an earlier run
-        if self.report:
-            require_plots()
-        dtype = self.case.run.get("dtype", "float64")
-        adapter = Adapter(create_context(self.device, fp64=dtype == "float64"), dtype=dtype)
+        size, arguments, files = self.peers.agree(self._prepare)
+        adapter = self.peers.agree(self._make_adapter)
         device = adapter.ctx.devices[0]
         where = f"{device.platform.name.strip()} / {device.name.strip()}"
+        where += f" and {self.peers.count - 1} more" * (self.peers.count > 1)
         results: dict[str, Result] = {}
         profiles: dict[str, Profile] = {}
         with self._stopping_cleanly():
@@ -154,10 +145,10 @@ class Job:
                     if self.interrupted:
                         break
             except ClvoroError:
-                if results:  # keep the meshes of earlier methods
+                if results and not self.pieces:  # keep the meshes of earlier methods
                     self._write(adapter, size, results, where)
                 raise
-            self._write(adapter, size, results, where)
+            self.peers.agree(lambda: self._write(adapter, size, results, where))
             frames = []
             if self.case.frames > 1 and not self.interrupted:
                 *_, last = results.values()
@@ -167,11 +158,58 @@ class Job:
         self.missed = any(result.stop_reason.startswith(MISSES) for result in results.values())
         self._summarize(results, where, profiles)
         self._tell_how_to_continue(files)
-        if self.solver is not None:
+        if self.solver is not None and self.peers.number == 0:
             self._check_for_solver(results)
         if frames and not self.quiet and not self.as_json:
             print(frames_line(frames))
         return self.interrupted
+
+    def _prepare(self) -> tuple[Any, dict[str, Any], Checkpoint | None]:
+        """Check all that can be known before the run; return the size field, the arguments and the checkpoint."""
+        arguments = self.case.run_arguments()
+        size = self._during("preparing the size field", self.case.size_field)
+        warn_of_unused(self.case.run, [m or Options.method for m in self.case.methods])
+        self._refuse_formats()
+        self._refuse_pieces()
+        self._land = self.case.land
+        self.case = self.case.with_patches(self.types)
+        patch_types(self.case.domain.boundary_names, self.case.patches)
+        files = self._checkpoints()
+        named = {"checkpoint": self.checkpoint, "resume": self.resume}
+        named |= {source.name: source for source in self.case.sources()}
+        refuse_own_files(self.out, named)
+        check_folder(self.out)
+        if files is not None and self.checkpoint is None and self.resume is None and self.peers.number == 0:
+            (self.out / STATE).unlink(missing_ok=True)  # of an earlier run
+        if self.report:
+            require_plots()
+        return size, arguments, files
+
+    def _make_adapter(self) -> Any:
+        from .. import Adapter, create_context
+
+        dtype = self.case.run.get("dtype", "float64")
+        return Adapter(create_context(self.device, fp64=dtype == "float64"), dtype=dtype, comm=self.peers)
+
+    def _refuse_pieces(self) -> None:
+        """Raise an error before the run if ranks cannot share it, or cannot write its files in pieces."""
+        if self.peers.count == 1:
+            if self.pieces:
+                raise InputError(
+                    "pieces are given, and one process has the whole mesh; start several with mpiexec -n, or leave "
+                    "--pieces out"
+                )
+            return
+        if self.case.frames > 1:
+            raise InputError(
+                f"{self.case.name}: the case has {self.case.frames} frames, expected one, since ranks share the run; "
+                "run it without mpiexec"
+            )
+        self.report = self.report and not self.pieces
+        others = [kind for kind in self.mesh_formats if kind != "openfoam"]
+        if self.pieces and (others or self.solver is not None):
+            given = f"format {others[0]}" if others else "check-solver"
+            raise InputError(f"{given} needs the whole mesh, and pieces are given; leave --pieces out")
 
     def _run_one(
         self, adapter: Any, size: Any, method: str | None, settings: dict[str, Any], files: Checkpoint | None
@@ -208,8 +246,9 @@ class Job:
                 )
             finally:
                 adapter.on_memory = adapter.on_build = adapter.on_work = None
-        if result.stop_reason == INTERRUPTED:
-            self.interrupted = True
+        self.interrupted = self.peers.any(self.interrupted or result.stop_reason == INTERRUPTED)
+        if not self.pieces:
+            result = result.gather() or result
         if self._land is not None:
             result = result.subset(earth.ocean(result, self._land))
         return replace(result, stop_reason=INTERRUPTED) if self.interrupted else result
@@ -265,7 +304,7 @@ class Job:
                 f"{self.case.name}: {next(iter(given))} is for a run of one method, and the case has "
                 f"{len(self.case.methods)}; choose one with --method"
             )
-        if len(self.case.methods) > 1:
+        if len(self.case.methods) > 1 or (self.peers.count > 1 and not given):
             return None
         if self.checkpoint is None:  # written only if the run is stopped
             return Checkpoint(self.out / STATE, math.inf, self.resume)
@@ -306,18 +345,24 @@ class Job:
             for number, handler in previous.items():
                 signal.signal(number, handler)
 
-    def _write(self, adapter: Any, size: Any, results: dict[str, Result], where: str) -> None:
-        from .. import __version__
+    @property
+    def _mesh_files(self) -> tuple[str, ...]:
+        """Names of the files that each mesh is written to."""
+        return ("mesh.pvtu",) if self.pieces else ("mesh.vtu", "mesh.npz")
 
+    def _mesh_file_of(self, other: str) -> str:
+        """Return the name of the mesh of another method than the last."""
+        return f"mesh-{other}{Path(self._mesh_files[-1]).suffix}"
+
+    def _write(self, adapter: Any, size: Any, results: dict[str, Result], where: str) -> None:
+        """Write all files: on rank 0, or in pieces on all of them."""
+        if self.peers.number and not self.pieces:
+            return
         *others, (_, main) = results.items()
         if not self.quiet and (sys.stderr.isatty() or len(main.points) > _MANY):
             work = "mesh and report" if self.report else "mesh"
             print(f"{self.case.name}: writing {work} into {self.out}", file=sys.stderr, flush=True)
-        tasks: list[Callable[[], object]] = [
-            partial(save, main, self.out / "mesh.vtu"),
-            partial(save, main, self.out / "mesh.npz"),
-            partial(write_history, main, self.out / "history.csv"),
-        ]
+        tasks: list[Callable[[], object]] = [partial(save, main, self.out / name) for name in self._mesh_files]
         for kind in self.mesh_formats:
             name, convention = MESH_FILES[kind]
             options: dict[str, Any] = {"convention": convention}
@@ -326,9 +371,12 @@ class Job:
             task = partial(write, main, self.out / name, **options)
             work = "solver mesh" if kind == "openfoam" else name
             tasks.append(partial(self._during, f"writing the {work}", task))
-        for other, result in others:
-            tasks.append(partial(save, result, self.out / f"mesh-{other}.npz"))
-            tasks.append(partial(write_history, result, self.out / f"history-{other}.csv"))
+        tasks += [partial(save, result, self.out / self._mesh_file_of(other)) for other, result in others]
+        if self.peers.number:  # the other files are of rank 0
+            do_all(tasks)
+            return
+        tasks.append(partial(write_history, main, self.out / "history.csv"))
+        tasks += [partial(write_history, result, self.out / f"history-{other}.csv") for other, result in others]
         note = "; interrupted: the mesh beside it is that of an earlier step" * self.interrupted
         header = (f"Written by clvoro {__version__} on {where}{note}.", "Repeat it with: clvoro run case.toml")
         repeatable = self._repeatable(results)
@@ -440,6 +488,8 @@ class Job:
                     print(f"{name}: {said}")
             if "trade" in result.settings:
                 print(f"{name}: {result.settings['trade']}")
+            if self.pieces:
+                continue
             if result.diagram.domain.cell_dim == 3:
                 print(f"{name}: {result.measures.line()}")
             if line := boundary_line(result):
@@ -451,10 +501,11 @@ class Job:
     def _written(self, results: dict[str, Result]) -> list[str]:
         """Return the names of all files and folders that the run has written."""
         *others, _ = results
-        found = ["mesh.vtu", "mesh.npz", "history.csv"]
+        found = [*self._mesh_files, "history.csv"]
+        places = "processor0/..." if self.pieces else "constant/polyMesh"
         for kind in self.mesh_formats:
-            found.append(MESH_FILES[kind][0] + " (with constant/polyMesh)" * (kind == "openfoam"))
-        found += [name for other in others for name in (f"mesh-{other}.npz", f"history-{other}.csv")]
+            found.append(MESH_FILES[kind][0] + f" (with {places})" * (kind == "openfoam"))
+        found += [name for other in others for name in (self._mesh_file_of(other), f"history-{other}.csv")]
         found += ["case.toml", *self.case.copies()]
         return found + ["report.html", "pictures/"] * self.report
 

@@ -274,10 +274,14 @@ def figures(size_error: np.ndarray, quality: np.ndarray) -> dict[str, float]:
 
 
 def summary(result: Result) -> dict[str, Any]:
-    """Return the figures of a run; see `Result.summary`."""
+    """Return the figures of a run; see `Result.summary`. Over ranks they are those of all cells."""
     history = result.history
     parts = beside_boundary(result).items()
     apart = {f"{part}_{name}": value for part, some in parts for name, value in some.items()}
+    cells, now = len(result.points), figures(result.size_error, result.quality)
+    if result.parts is not None:
+        last = result.history[-1]
+        cells, now = int(last["cells"]), {name: float(last[name]) for name in now}
     what = result.diagram.domain.leaves_out
     if what and not result.diagram.is_power:
         left = result.diagram.left_out
@@ -285,9 +289,9 @@ def summary(result: Result) -> dict[str, Any]:
     if in_layers := int(np.count_nonzero(result.diagram.layer)):
         apart |= {"layer_cells": in_layers, "thickness": result.settings.get("thickness")}
     return {
-        "cells": len(result.points),
+        "cells": cells,
         "steps": int(history["step"][-1]) if len(history) else 0,
-        **figures(result.size_error, result.quality),
+        **now,
         "size_factor": float(result.size_factor),
         "error_target": result.settings.get("error_target"),
         "trade": result.settings.get("trade"),

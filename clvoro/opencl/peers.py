@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, TypeVar, cast
 import numpy as np
 
 from ..errors import InputError, InputTypeError, RankError
+from ..version import __version__
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -18,8 +19,10 @@ Made = TypeVar("Made")
 PATIENCE, NAP = 30, 2e-5
 """A rank that waits for a message sleeps for `NAP` seconds between two questions after the first `PATIENCE`. There may
 be more ranks than cores."""
-ALARM = 1
-"""Tag of the message that a rank sends when it fails."""
+ALARM, CLOSE, CLOSED = 1, 2, 3
+"""Tags of the message that a rank sends when it fails, of the exit code, and of the answer to that."""
+GRACE = 1.0
+"""Seconds that rank 0 waits for answers to the exit code. The others wait half as long again for the code."""
 
 
 class Peers:
@@ -87,8 +90,6 @@ class Peers:
         RankError
             On the others; or if `prepare` raises an error in another part.
         """
-        from .. import __version__
-
         if self.count == 1:
             return prepare()
         error, made, told = None, None, {"version": __version__}
@@ -106,15 +107,28 @@ class Peers:
                 raise RankError(f"rank {number} of {self.count} has failed: {other['error']}")
         for number, other in enumerate(found):
             for name in {**found[0], **other}:
-                if (expected := found[0].get(name)) != (value := other.get(name)):
-                    raise (RankError if self.number else InputError)(
-                        f"rank {number} of {self.count} has {name} = {value!s:.200}, expected {expected!s:.200}, as "
-                        "rank 0 has; give all ranks the same arguments and the same version of clvoro"
-                    )
+                if (expected := found[0].get(name)) == (value := other.get(name)):
+                    continue
+                where = f"rank {number} of {self.count} has {name} = {value!s:.200}, expected {expected!s:.200},"
+                if self.number:
+                    raise RankError(f"{where} as rank 0 has")
+                raise InputError(
+                    f"{where} as rank 0 has; give all ranks the same arguments and the same version of clvoro"
+                )
         return cast("Made", made)
 
     def fail(self, error: BaseException) -> None:
         """Tell the others that this part fails. They raise a `RankError` where they wait for it."""
+
+    def close(self, code: int) -> None:
+        """On part 0: give the others the exit `code`, and end all processes if one of them does not take it."""
+
+    def await_close(self) -> int | None:
+        """On other parts: return the exit code of part 0, or None if it does not give one in time."""
+        return None
+
+    def abort(self, code: int) -> None:
+        """End the processes of all parts."""
 
 
 ALONE = Peers()
@@ -191,6 +205,34 @@ class Ranks(Peers):
         for part in range(self.count):
             if part != self.number:
                 self._alarms.isend(self._failed, part, ALARM)
+
+    def close(self, code: int) -> None:
+        """Send `code` to the others, and wait for their answers."""
+        for part in range(1, self.count):
+            self._alarms.isend(code, part, CLOSE)
+        for part in range(1, self.count):
+            if self._hear(part, CLOSED, GRACE) is None:
+                self.abort(code)
+
+    def await_close(self) -> int | None:
+        """Wait for the code, and answer."""
+        code = self._hear(0, CLOSE, 1.5 * GRACE)
+        if code is not None:
+            self._alarms.isend(code, 0, CLOSED)
+        return code
+
+    def abort(self, code: int) -> None:
+        """End all processes that `mpiexec` has started."""
+        self._comm.Abort(code)
+
+    def _hear(self, part: int, tag: int, seconds: float) -> int | None:
+        """Return the number that `part` sends, or None if it does not send one in time."""
+        latest = time.monotonic() + seconds
+        while not self._alarms.Iprobe(part, tag):
+            if time.monotonic() > latest:
+                return None
+            time.sleep(50 * NAP)
+        return int(self._alarms.recv(source=part, tag=tag))
 
 
 def _bytes(values: np.ndarray) -> np.ndarray:

@@ -1,16 +1,21 @@
 """Runs that parts of a domain share: in threads, and over the ranks of MPI."""
 
 import importlib.util
+import json
 import os
 import subprocess
 import sys
+import types
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 import clvoro
-from clvoro.errors import InputError, InputTypeError, RankError
+from clvoro.cli.cases import load_case
+from clvoro.cli.jobs import Job
+from clvoro.cli.ranks import this_rank
+from clvoro.errors import InputError, InputTypeError, MissingLibraryError, RankError
 from clvoro.opencl.peers import Peers
 from tests.reference.peers import run_parts
 
@@ -36,6 +41,29 @@ try:
     adapter.run(clvoro.Box((0, 0), (1, 1)), 0.1, "fast", callback=fail)
 except Exception as error:
     print(type(error).__name__, error, file=out)
+"""
+COMMANDS = """
+import os, resource, sys
+from clvoro.cli import main
+
+folder, pieces = sys.argv[1], ["--pieces", "--json"]
+for name, options in {"whole": ["--no-report"], "pieces": pieces, "missing": [], "full": pieces}.items():
+    if name == "full" and os.environ["PMI_RANK"] == "1":
+        resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000))
+    case = f"{folder}/{'missing' if name == 'missing' else 'box'}.toml"
+    code = main(["run", case, "--out", f"{folder}/{name}", *options])
+    print(name, code, file=open(f"{folder}/{os.environ['PMI_RANK']}", "a"))
+"""
+CASE = """
+[domain]
+lower = [0.0, 0.0]
+upper = [1.0, 1.0]
+[size]
+kind = "constant"
+value = 0.12
+[run]
+method = "lloyd"
+max_steps = 2
 """
 
 
@@ -126,30 +154,95 @@ def test_what_ranks_cannot_share_is_refused(ctx, change):
 
 
 @pytest.mark.parametrize(
-    ("name", "told"), [("seed", "seed = 1, expected 0"), ("points", "points = "), ("size", "cells")]
+    ("name", "shown"), [("seed", "seed = 1, expected 0"), ("points", "points = "), ("size", "cells")]
 )
-def test_parts_with_other_input_are_refused(ctx, name, told):
+def test_parts_with_other_input_are_refused(ctx, name, shown):
     def work(peers):
         adapter, errors = clvoro.Adapter(ctx), InputError if peers.number == 0 else RankError
         adapter._peers = peers
         changed = {"seed": peers.number, "points": [(0.5, 0.2 + 0.1 * peers.number)], "size": 0.2 - 0.1 * peers.number}
-        with pytest.raises(errors, match=f"rank 1 of 2 has {told}"):
+        with pytest.raises(errors, match=f"rank 1 of 2 has {shown}"):
             adapter.run(clvoro.Box((0, 0), (1, 1)), **{"size": 0.2, name: changed[name]})
 
     run_parts(2, work)
 
 
-@pytest.mark.skipif(importlib.util.find_spec("mpi4py") is None, reason="mpi4py is not installed")
-def test_a_script_under_mpiexec(tmp_path):
-    script = tmp_path / "script.py"
-    script.write_text(SCRIPT)
+needs_mpi = pytest.mark.skipif(importlib.util.find_spec("mpi4py") is None, reason="mpi4py is not installed")
+
+
+def run_script(text, folder):
+    """Run a script on two ranks, and return what it has printed."""
+    script = folder / "script.py"
+    script.write_text(text)
     mpiexec = Path(sys.executable).parent / "mpiexec"
     environment = {**os.environ, "POCL_MAX_PTHREAD_COUNT": "1", "PYTHONPATH": str(Path(clvoro.__file__).parents[1])}
-    command = [str(mpiexec if mpiexec.exists() else "mpiexec"), "-n", "2", sys.executable, str(script), str(tmp_path)]
+    command = [str(mpiexec if mpiexec.exists() else "mpiexec"), "-n", "2", sys.executable, str(script), str(folder)]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=240)
     assert done.returncode == 0, done.stderr[-3000:]
-    line, told = (tmp_path / "0").read_text().splitlines()
-    assert told == "RankError rank 1 of 2 has failed: OSError: no space left"
+    return done
+
+
+@needs_mpi
+def test_the_command_under_mpiexec(tmp_path):
+    """Rank 0 speaks and writes; in pieces each rank writes its cells. What fails on one rank is said once."""
+    (tmp_path / "box.toml").write_text(CASE)
+    done = run_script(COMMANDS, tmp_path)
+    for rank in "01":
+        assert (tmp_path / rank).read_text().split() == "whole 0 pieces 0 missing 2 full 1".split(), done.stderr
+    assert done.stdout.count("written into") == 1
+    shown = [line for line in done.stderr.splitlines() if line.startswith("clvoro: ")]
+    assert len(shown) == 2, done.stderr
+    assert "missing.toml" in shown[0]
+    assert "mesh_1.vtu" in shown[1]
+    assert "File too large" in shown[1]
+    assert {file.name for file in (tmp_path / "whole").iterdir()} == {
+        "mesh.vtu",
+        "mesh.npz",
+        "history.csv",
+        "case.toml",
+    }
+    files = {file.name for file in (tmp_path / "pieces").iterdir()}
+    assert files == {"mesh.pvtu", "mesh_0.vtu", "mesh_1.vtu", "history.csv", "case.toml"}
+    whole = clvoro.load(tmp_path / "whole/mesh.npz")
+    assert whole.check()
+    record = json.loads(next(line for line in done.stdout.splitlines() if line.startswith("{")))
+    assert record["cells"] == len(whole) == sum(len(clvoro.load(tmp_path / f"pieces/mesh_{k}.vtu")) for k in (0, 1))
+    assert np.isclose(record["mean_error"], np.abs(whole.size_error).mean())
+
+
+def test_what_the_command_refuses_over_ranks(tmp_path, monkeypatch):
+    """Each call works without what the error says."""
+    (tmp_path / "box.toml").write_text(CASE)
+    case, ranks = load_case(tmp_path / "box.toml"), Peers()
+    ranks.count = 2
+    with pytest.raises(InputError, match="one process has the whole mesh"):
+        Job(case, tmp_path, pieces=True)._refuse_pieces()
+    for changed in ({"mesh_formats": ("vtk",)}, {"solver": "openfoam"}):
+        with pytest.raises(InputError, match="needs the whole mesh, and pieces"):
+            Job(case, tmp_path, pieces=True, peers=ranks, **changed)._refuse_pieces()
+        Job(case, tmp_path, peers=ranks, **changed)._refuse_pieces()
+    with pytest.raises(InputError, match="has 32 frames, expected one"):
+        Job(load_case("spots"), tmp_path, peers=ranks)._refuse_pieces()
+
+    monkeypatch.setenv("PMI_SIZE", "2")
+    mpi4py = types.ModuleType("mpi4py")
+    monkeypatch.setitem(sys.modules, "mpi4py", mpi4py)
+    with pytest.raises(MissingLibraryError, match="call clvoro without mpiexec"):
+        this_rank()
+    alone = types.SimpleNamespace(Get_rank=lambda: 0, Get_size=lambda: 1, Iallgather=None)
+    alone.Dup = lambda: alone
+    mpi4py.MPI = types.SimpleNamespace(COMM_WORLD=alone, Get_library_version=lambda: "MPICH")
+    with pytest.raises(InputError, match="mpi4py belongs to another MPI"):
+        this_rank()
+    monkeypatch.setenv("PMI_SIZE", "1")
+    assert this_rank().count == 1
+
+
+@needs_mpi
+def test_a_script_under_mpiexec(tmp_path):
+    run_script(SCRIPT, tmp_path)
+    line, shown = (tmp_path / "0").read_text().splitlines()
+    assert shown == "RankError rank 1 of 2 has failed: OSError: no space left"
     assert (tmp_path / "1").read_text() == "OSError no space left\n"
     cells, own, recorded = map(int, line.split())
     assert cells == recorded > own > cells / 3
