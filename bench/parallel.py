@@ -52,7 +52,7 @@ def measure_rank(options: argparse.Namespace) -> None:
     dim, cells, effort, comm = options.rank, options.cells, options.effort, MPI.COMM_WORLD
     box, rounds, ghosts = clvoro.Box((0,) * dim, (1,) * dim), [], [0]
     adapter = clvoro.Adapter(clvoro.create_context(options.device), options.dtype, comm=comm)
-    finish = PartSteps.finish
+    finish = PartSteps._finished
 
     def noted(steps, part, *given):
         found = finish(steps, part, *given)
@@ -61,7 +61,7 @@ def measure_rank(options: argparse.Namespace) -> None:
             ghosts[0] = part.count - part.n_own
         return found
 
-    PartSteps.finish = noted
+    PartSteps._finished = noted
     x = np.random.default_rng(1).random((cells, dim))
     whole = adapter.run(box, cells ** (-1 / dim), points=x, method="lloyd", max_steps=0).gather()
     digest = hashlib.sha256()

@@ -17,7 +17,7 @@ kernel void mark_ghosts(const int size, global const int *starts, global const i
     WORK_ITEM(i);
     for (int k = starts[i]; k < starts[i + 1]; ++k)
         if (neighbors[k] >= size)
-            marks[neighbors[k] - size] = 1;
+            marks[neighbors[k]] = 1;
 }
 
 /* A number from 1 to 2 for the face between the generators with labels a and b, whichever comes first. */
@@ -28,16 +28,36 @@ inline REAL weight_of_face(int a, int b)
     return 1 + (REAL)(h >> 16) / 65536;
 }
 
-/* sums[3 t ...] = the volumes of the generators t, t + size, ... of n; the weighted measures of their faces with
-   ghosts, positive in the cell of the lower label; and those without signs. Over all parts the second sum is zero if
-   each face has both sides. One work-item per t. */
+/* Whether all generators are known in the ball around generator i with the radius needed * reach[i], and whether no
+   other part needs to know it that does not. At the position at[i] all are known within limits[i].s0, and other parts
+   know the generator or have no ball nearer than limits[i].s1. */
+inline bool is_within_limits(int i, REAL needed, global const float *reach, global const REAL *points,
+                             global const REAL *at, global const float2 *limits)
+{
+    REAL moved2 = 0;
+    for (int a = 0; a < DIM; ++a) {
+        const REAL d = points[DIM * i + a] - at[DIM * i + a];
+        moved2 += d * d;
+    }
+    const REAL moved = sqrt(moved2);
+    return needed * reach[i] + moved <= limits[i].s0 && moved <= limits[i].s1;
+}
+
+/* sums[4 t ...] = the volumes of the generators t, t + size, ... of n; the weighted measures of their faces with
+   ghosts, positive in the cell of the lower label; those without signs; and the number of rows t, t + size, ..., of
+   ghosts only marked ones, that are not within their limits. Over all parts the second sum is zero if each face has
+   both sides. One work-item per t. */
 kernel void sum_cells(const int size, const int n, global const int *starts, global const int *neighbors,
                       global const int *labels, global const FACE *face_measures, global const REAL *volumes,
-                      global REAL *sums)
+                      global const int *marks, const int rows, global const float *reach, global const REAL *points,
+                      global const REAL *at, global const float2 *limits, const REAL needed, global REAL *sums)
 {
     WORK_ITEM(t);
-    REAL volume = 0, signed_sum = 0, sum = 0;
-    for (int i = t; i < n; i += size) {
+    REAL volume = 0, signed_sum = 0, sum = 0, beyond = 0;
+    for (int i = t; i < rows; i += size) {
+        beyond += (i < n || marks[i]) && !is_within_limits(i, needed, reach, points, at, limits);
+        if (i >= n)
+            continue;
         volume += volumes[i];
         for (int k = starts[i]; k < starts[i + 1]; ++k) {
             const int j = neighbors[k];
@@ -48,9 +68,10 @@ kernel void sum_cells(const int size, const int n, global const int *starts, glo
             sum += part;
         }
     }
-    sums[3 * t] = volume;
-    sums[3 * t + 1] = signed_sum;
-    sums[3 * t + 2] = sum;
+    sums[4 * t] = volume;
+    sums[4 * t + 1] = signed_sum;
+    sums[4 * t + 2] = sum;
+    sums[4 * t + 3] = beyond;
 }
 
 /* values[n + g] = values[rows[g]] for each ghost g. Rows of values have `words` 32-bit words of any type. A ghost
@@ -61,4 +82,23 @@ kernel void forward_values(const int size, const int n, global const int *rows, 
     const int i = rows[g];
     for (int w = 0; w < words && i >= 0; ++w)
         values[words * (n + g) + w] = values[words * i + w];
+}
+
+/* Columns `first` to `first` + `words` of packed[p], which has `row` columns, = values[items[p]]: rows of 32-bit words
+   of any type. One work-item per item. */
+kernel void pack_rows(const int size, global const int *items, global const uint *values, const int words,
+                      const int row, const int first, global uint *packed)
+{
+    WORK_ITEM(p);
+    for (int w = 0; w < words; ++w)
+        packed[row * p + first + w] = values[words * items[p] + w];
+}
+
+/* values[n + p] = those columns of packed[p]. One work-item per row. */
+kernel void unpack_rows(const int size, const int n, global const uint *packed, const int words, const int row,
+                        const int first, global uint *values)
+{
+    WORK_ITEM(p);
+    for (int w = 0; w < words; ++w)
+        values[words * (n + p) + w] = packed[row * p + first + w];
 }

@@ -255,10 +255,9 @@ class InsertionDeletion:
         kinds = self._room("kinds", size=2 * t.rows, dtype=np.int32).reshape(-1, 2)
         raw, once = (self._room("strain", turn, size=4 * t.rows, dtype=np.float32).reshape(-1, 4) for turn in range(2))
         with engine.workspace.frame():
-            h = t.with_ghosts(engine, h)
+            (h,) = t.with_ghosts(engine, h)
             engine.run_each(k.measure_strain, n, *graph, h, kinds, raw, *t.outlines, *engine.period_args)
-        for values in (kinds, raw):
-            t.forward(engine, values)
+        t.forward(engine, kinds, raw)
         for values, mean in ((raw, once), (once, raw)):
             engine.run_each(k.average_strain, n, *graph, values, mean)
             t.forward(engine, mean)
@@ -351,8 +350,7 @@ class InsertionDeletion:
         shifts = (np.arange(SHIFTS) - SHIFTS // 2) * SHIFT_STEP
         order = np.argsort(np.abs(shifts), kind="stable")
         best = order[np.argmin(np.abs(changes[order] - need))]
-        for values in (chosen, pull, partners):
-            t.forward(engine, values)
+        t.forward(engine, chosen, pull, partners)
         engine.run_each(
             k.mark_pairs,
             n,

@@ -129,7 +129,7 @@ class WeightedMethod(Method):
                 t.neighbors,
                 t.face_measures,
                 t.points,
-                t.with_ghosts(engine, w.density),
+                *t.with_ghosts(engine, w.density),
                 tolerance=self.tolerance,
                 part=t.part,
             )

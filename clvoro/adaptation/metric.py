@@ -53,7 +53,7 @@ class Metric:
         sets = (0, *[t.starts] * 5)
         if compared is not None:
             labels, *arrays, first = compared
-            sets = (2 if first else 1, t.neighbors, t.with_ghosts(self.engine, labels), *arrays)
+            sets = (2 if first else 1, t.neighbors, t.names(self.engine, labels), *arrays)
         self.engine.run_each(
             self._kernels.evaluate_metric,
             t.n,

@@ -119,7 +119,7 @@ class Motion:
                 t.face_centroids,
                 t.volumes,
                 t.points,
-                t.with_ghosts(self.engine, psi),
+                *t.with_ghosts(self.engine, psi),
                 u,
                 *self.engine.period_args,
             )

@@ -129,6 +129,7 @@ class Engine:
         self.workspace = Workspace(queue) if workspace is None else workspace
         self.pool = KernelPool() if pool is None else pool
         self.peers = peers
+        self._shared_kernels: dict[str, Kernels] = {}
 
     def replaced(self, *, real: np.dtype | None = None, traits: Traits | None = None) -> Engine:
         """Return an engine of another precision or other traits that shares workspace and kernels with this one."""
@@ -188,7 +189,12 @@ class Engine:
         return "double" if real == np.float64 else "float"
 
     def kernels(
-        self, stage: str, defines: Mapping[str, object] | None = None, prelude: str = "", group_size: int | None = None
+        self,
+        stage: str,
+        defines: Mapping[str, object] | None = None,
+        prelude: str = "",
+        group_size: int | None = None,
+        shared: bool = False,
     ) -> Kernels:
         """Return the kernels of `cl_kernels/<stage>.cl`; see `Kernels`.
 
@@ -201,7 +207,13 @@ class Engine:
             OpenCL C before the file.
         group_size : int, optional
             Work-items per group of block-wise kernels, by default the engine's.
+        shared : bool
+            Return the same kernels in each call for `stage`, for launches that set all arguments.
         """
+        if shared:
+            if stage not in self._shared_kernels:
+                self._shared_kernels[stage] = self.kernels(stage, defines, prelude, group_size)
+            return self._shared_kernels[stage]
         name, full = f"{stage}.cl", self.all_defines(stage, defines or {})
         # Called through the module, because tests replace the function.
         return Kernels(

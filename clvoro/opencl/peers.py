@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, TypeVar, cast
@@ -16,9 +17,9 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
 Made = TypeVar("Made")
-PATIENCE, NAP = 30, 2e-5
-"""A rank that waits for a message sleeps for `NAP` seconds between two questions after the first `PATIENCE`. There may
-be more ranks than cores."""
+PATIENCE, NAPS = 30, (2e-5, 1e-3)
+"""A rank that waits for a message asks `PATIENCE` times at once. Then it sleeps between two questions for an eighth of
+the time that it has waited, but within `NAPS`, in seconds. There may be more ranks than cores."""
 ALARM, CLOSE, CLOSED = 1, 2, 3
 """Tags of the message that a rank sends when it fails, of the exit code, and of the answer to that."""
 GRACE = 1.0
@@ -51,6 +52,14 @@ class Peers:
         parts know theirs.
         """
         return list(sent)
+
+    def swap(self, sent: np.ndarray, sent_sizes: np.ndarray, received: np.ndarray, sizes: np.ndarray) -> None:
+        """Do the same as `exchange` with rows for all parts in one array, and write what arrives to `received`.
+
+        The sizes (p,) are the numbers of rows for each part, and of rows from each part.
+        """
+        found = self.exchange(np.split(sent, np.cumsum(sent_sizes)[:-1]), sizes)
+        np.concatenate(found, out=received)
 
     def gather(self, values: np.ndarray) -> list[np.ndarray]:
         """Return the `values` of all parts, arrays of one shape, in their order."""
@@ -176,6 +185,20 @@ class Ranks(Peers):
         self._complete(*requests)
         return received
 
+    def swap(self, sent: np.ndarray, sent_sizes: np.ndarray, received: np.ndarray, sizes: np.ndarray) -> None:
+        """Send and receive slices of both arrays."""
+        self.exchanges += 1
+        requests, row = [], sent.dtype.itemsize * math.prod(sent.shape[1:])
+        given, taken = _bytes(sent), _bytes(received)
+        for buffer, counts, begin in ((taken, sizes, self._comm.Irecv), (given, sent_sizes, self._comm.Isend)):
+            ends = np.cumsum(counts) * row
+            requests += [
+                begin(buffer[end - row * size : end], part)
+                for part, (end, size) in enumerate(zip(ends.tolist(), counts.tolist(), strict=True))
+                if size
+            ]
+        self._complete(*requests)
+
     def gather(self, values: np.ndarray) -> list[np.ndarray]:
         """Collect one array of each rank on all of them."""
         self.reductions += 1
@@ -188,14 +211,15 @@ class Ranks(Peers):
         """Wait for `requests`, unless a rank fails."""
         if self._failed:
             raise RankError(self._failed)
-        turns = 0
-        while not all(request.Test() for request in requests):
+        left, turns, began, waited = list(requests), 0, time.perf_counter(), 0.0
+        while left := [request for request in left if not request.Test()]:
             turns += 1
             if turns > PATIENCE:
                 if self._alarms.Iprobe(tag=ALARM):
                     self._failed = self._alarms.recv(tag=ALARM)
                     raise RankError(self._failed)
-                time.sleep(NAP)
+                time.sleep(min(max(waited / 8, NAPS[0]), NAPS[1]))
+                waited = time.perf_counter() - began
 
     def fail(self, error: BaseException) -> None:
         """Send the text of `error` to all other ranks."""

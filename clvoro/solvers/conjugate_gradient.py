@@ -325,7 +325,8 @@ class _Iteration:
         """Set r to the true residual, of x or of zero."""
         if not from_zero:
             part = self._operator.part
-            self._operator.apply(self._x if part is None else part.with_ghosts(self._engine, self._x), self._q)
+            (x,) = [self._x] if part is None else part.with_ghosts(self._engine, self._x)
+            self._operator.apply(x, self._q)
         k, anew = self._kernels, np.int32(from_zero)
         partial, state, _ = self._tail
         self._launch(k.sum_right_sides, self._size, anew, self._rhs, self._q, partial)

@@ -218,20 +218,18 @@ class VolumeProjection:
         real, sums = self.engine.real.type, targets.sums
         if sums is not None and self.engine.peers.count > 1:
             sums = self.engine.upload(self.engine.peers.total(sums.get()))
-
-        def of_all(values: cla.Array) -> cla.Array:
-            return t.with_ghosts(self.engine, values)
-
+        of_all = t.with_ghosts(self.engine, t.volumes, targets.h, targets.quality, displacement)
+        volumes, h, quality, displacement = of_all
         return (
             t.face_measures,
             t.face_centroids,
-            of_all(t.volumes),
+            volumes,
             t.points,
             targets.gradient,
-            of_all(targets.h),
-            of_all(targets.quality),
+            h,
+            quality,
             targets.log_ratio,
-            of_all(displacement),
+            displacement,
             real(penalty.eps),
             real(penalty.quality_scale),
             real(min(penalty.eps, penalty.most_at_walls)),
@@ -239,8 +237,7 @@ class VolumeProjection:
             real(penalty.log_ratio_scale),
             penalty.power,
             *((self._partial, 0) if sums is None else (sums, len(sums) // 2)),
-            t.starts if labels is None else of_all(labels),
-            fixed,
+            *t.fixed_args(self.engine, labels, fixed),
         )
 
     def _iterate(self, t: Tessellation, v: _Arrays, direction: Launch, update: Launch, most: int) -> list[list[float]]:

@@ -195,21 +195,26 @@ class Tessellation:
             reach=None if self.reach is None else self.reach[:n],
         )
 
-    def forward(self, engine: Engine, values: cla.Array) -> None:
-        """Fill the rows of ghosts in `values` (rows, ...), if there are any."""
+    def forward(self, engine: Engine, *values: cla.Array) -> None:
+        """Fill the rows of ghosts in each of `values` (rows, ...), if there are any."""
         if self.part is not None:
-            self.part.forward(engine, values)
+            self.part.forward(engine, *values)
 
-    def with_ghosts(self, engine: Engine, values: cla.Array) -> cla.Array:
-        """Return `values` (n, ...) and behind them those of ghosts, in the workspace; `values` if there are none."""
-        return values if self.part is None else self.part.with_ghosts(engine, values)
+    def with_ghosts(self, engine: Engine, *values: cla.Array) -> list[cla.Array]:
+        """Return each of `values` (n, ...) and behind it that of ghosts, in the workspace; as it is without ghosts."""
+        return list(values) if self.part is None else self.part.with_ghosts(engine, *values)
+
+    def names(self, engine: Engine, labels: cla.Array) -> cla.Array:
+        """Return `labels` (n,) int32 of the generators, and behind them those of ghosts."""
+        known = None if self.part is None else self.part.labels
+        return self.with_ghosts(engine, labels)[0] if known is None else known
 
     def fixed_args(self, engine: Engine, labels: cla.Array | None, fixed: int) -> tuple[object, ...]:
         """Return `labels` (n,) int32 with those of ghosts, and `fixed`, as arguments of kernels.
 
         Generators with labels below `fixed` are. Without `labels` none is, and another array stands for them.
         """
-        return self.starts if labels is None else self.with_ghosts(engine, labels), np.int32(fixed)
+        return self.starts if labels is None else self.names(engine, labels), np.int32(fixed)
 
     @property
     def name_args(self) -> tuple[object, ...]:

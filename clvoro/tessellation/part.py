@@ -12,6 +12,7 @@ position of a neighbor take its nearest image (the PERIODIC macros).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
@@ -24,7 +25,6 @@ from ..geometry.domain import ClipBox
 from ..opencl.device_array import buffer_of
 from ..opencl.engine import Engine
 from ..opencl.peers import Peers
-from ..opencl.primitives import Gather
 
 if TYPE_CHECKING:
     from .device_diagram import Tessellation
@@ -84,22 +84,37 @@ class Ghosts:
         needed = engine.upload(np.concatenate(sent), np.int32)
         return cls(engine.upload(rows, np.int32), None, None, peers, parts, needed, sizes, counts)
 
-    def fill(self, engine: Engine, n_own: int, values: cla.Array) -> None:
-        """Fill the rows of `values` from `n_own` on with the values of the owners; see `Part.forward`."""
+    def fill(self, engine: Engine, n_own: int, *values: cla.Array) -> None:
+        """Fill the rows of each of `values` from `n_own` on with the values of the owners; see `Part.forward`."""
+        kernels = engine.kernels("tessellation/part", shared=True)
+        words = [math.prod(array.shape[1:]) * array.dtype.itemsize // 4 for array in values]
         if self.peers is None:
-            words = np.int32(int(np.prod(values.shape[1:])) * values.dtype.itemsize // 4)
-            forward = engine.kernels("tessellation/part").forward_values
-            engine.run_each(forward, values.shape[0] - n_own, np.int32(n_own), self.rows, words, values)
+            for array, width in zip(values, words, strict=True):
+                size = array.shape[0] - n_own
+                engine.run_each(kernels.forward_values, size, np.int32(n_own), self.rows, np.int32(width), array)
             return
         assert self.sent is not None
-        packed = np.empty((0, *values.shape[1:]), values.dtype)
-        if len(self.sent):
-            packed = Gather(engine).rows(self.sent, values).get()
-        ends = np.cumsum(self.sent_counts)[:-1]
-        received = np.concatenate(self.peers.exchange(np.split(packed, ends), self.counts))
-        if len(received):
-            start = n_own * (values.nbytes // values.shape[0])
-            cl.enqueue_copy(engine.queue, buffer_of(values), np.ascontiguousarray(received), dst_offset=start)
+        row, s, g = sum(words), len(self.sent), len(self.parts)
+        columns = [(np.int32(width), np.int32(row), np.int32(sum(words[:k]))) for k, width in enumerate(words)]
+        with engine.workspace.frame():
+            packed, given = np.empty((s, row), np.uint32), engine.scratch(s * row, np.uint32)
+            for array, which in zip(values, columns, strict=True):
+                if s:
+                    engine.run_each(kernels.pack_rows, s, self.sent, array, *which, given)
+            if s:
+                cl.enqueue_copy(engine.queue, packed, buffer_of(given))
+            received = np.empty((g, row), np.uint32)
+            self.peers.swap(packed, np.asarray(self.sent_counts), received, np.asarray(self.counts))
+            if not g:
+                return
+            if len(values) == 1:
+                start = n_own * 4 * row
+                cl.enqueue_copy(engine.queue, buffer_of(values[0]), received, dst_offset=start)
+                return
+            taken = engine.scratch(g * row, np.uint32)
+            taken.set(received.ravel())
+            for array, which in zip(values, columns, strict=True):
+                engine.run_each(kernels.unpack_rows, g, np.int32(n_own), taken, *which, array)
 
 
 @dataclass(frozen=True)
@@ -151,7 +166,7 @@ class Part:
         if self.ghosts is None or self.peers is not None:
             return neighbors
         named = engine.scratch(len(neighbors), np.int32)
-        kernel = engine.kernels("tessellation/part").name_owners
+        kernel = engine.kernels("tessellation/part", shared=True).name_owners
         engine.run_each(kernel, self.n_own, np.int32(self.n_own), self.ghosts.rows, starts, neighbors, named)
         return named
 
@@ -173,36 +188,74 @@ class Part:
         self.order_rows(engine, t, {**defines, "FACE": engine.name_of(engine.real)})
         return t
 
-    def neighboring_ghosts(self, engine: Engine, t: Tessellation) -> np.ndarray:
-        """Return the rows of ghosts that are neighbors of own generators in `t`, a diagram of this part, (k,) int."""
-        marks = engine.scratch(max(self.count - self.n_own, 1), np.int32)
+    def mark_neighbors(self, engine: Engine, t: Tessellation, marks: cla.Array) -> None:
+        """Set `marks` (count,) int32 to 1 for ghosts that are neighbors of own generators in `t`, else to 0."""
         marks.fill(0)
-        engine.run_each(engine.kernels("tessellation/part").mark_ghosts, self.n_own, t.starts, t.neighbors, marks)
-        return self.n_own + np.flatnonzero(marks.get()[: self.count - self.n_own])
+        engine.run_each(
+            engine.kernels("tessellation/part", shared=True).mark_ghosts, self.n_own, t.starts, t.neighbors, marks
+        )
 
-    def sums(self, engine: Engine, t: Tessellation) -> np.ndarray:
-        """Return the volume of own cells, and of their faces with ghosts the signed sum and the sum of measures, (3,).
+    def sums(
+        self,
+        engine: Engine,
+        t: Tessellation,
+        marks: cla.Array,
+        rows: int,
+        reach: cla.Array,
+        at: cla.Array,
+        limits: cla.Array,
+        needed: float,
+    ) -> np.ndarray:
+        """Return sums over own cells that prove, with those of all parts, that `t` is a part of the whole diagram.
 
-        The signed sums of all parts add up to zero if each face between two parts has both sides.
+        Parameters
+        ----------
+        marks : (count,) int32
+            1 for ghosts whose cells must be final.
+        rows : int
+            Number of rows of which cells must be final: own ones, and marked ghosts among the others.
+        reach : (rows,) float32
+            See `Tessellation`.
+        at, limits : (count, d) real, (count, 2) float32
+            For each row an earlier position, a radius within which all generators are known there, and how far the
+            generator may move from there.
+        needed : float
+            Radius of the ball that must be known, over the reach.
+
+        Returns
+        -------
+        (4,) ndarray
+            Volume of own cells. Of their faces with ghosts the signed sum, and the sum of measures: the signed sums of
+            all parts add up to zero if each face between two parts has both sides. Number of rows beyond their limits.
         """
-        sums = engine.scratch((SUMS, 3))
-        given = (t.starts, t.neighbors, self.labels, t.face_measures, t.volumes)
-        engine.run_each(engine.kernels("tessellation/part").sum_cells, SUMS, np.int32(self.n_own), *given, sums)
+        sums = engine.scratch((SUMS, 4))
+        given = t.starts, t.neighbors, self.labels, t.face_measures, t.volumes
+        limited = marks, np.int32(rows), reach, self.points, at, limits, engine.real.type(needed)
+        engine.run_each(
+            engine.kernels("tessellation/part", shared=True).sum_cells,
+            SUMS,
+            np.int32(self.n_own),
+            *given,
+            *limited,
+            sums,
+        )
         return sums.get().sum(axis=0, dtype=float)
 
-    def forward(self, engine: Engine, values: cla.Array) -> None:
-        """Fill the rows of ghosts in `values` (count, ...), of whole 32-bit words, with the values of their owners.
+    def forward(self, engine: Engine, *values: cla.Array) -> None:
+        """Fill the rows of ghosts in each of `values` (count, ...) with the values of their owners.
 
-        Rows of ghosts without owner stay as they are.
+        Values are whole 32-bit words of any type. Rows of ghosts without owner stay as they are. Other parts get all
+        `values` in one message.
         """
         if self.ghosts is not None:
-            self.ghosts.fill(engine, self.n_own, values)
+            self.ghosts.fill(engine, self.n_own, *values)
 
-    def with_ghosts(self, engine: Engine, values: cla.Array) -> cla.Array:
-        """Return `values` (n_own, ...) and behind them those of ghosts, in the workspace."""
+    def with_ghosts(self, engine: Engine, *values: cla.Array) -> list[cla.Array]:
+        """Return each of `values` (n_own, ...) with those of ghosts behind them, in the workspace."""
         if self.ghosts is None:
-            return values
-        extended = engine.scratch((self.count, *values.shape[1:]), values.dtype)
-        cl.enqueue_copy(engine.queue, buffer_of(extended), buffer_of(values), byte_count=values.nbytes)
-        self.forward(engine, extended)
-        return extended
+            return list(values)
+        all_of = [engine.scratch((self.count, *array.shape[1:]), array.dtype) for array in values]
+        for extended, array in zip(all_of, values, strict=True):
+            cl.enqueue_copy(engine.queue, buffer_of(extended), buffer_of(array), byte_count=array.nbytes)
+        self.forward(engine, *all_of)
+        return all_of

@@ -2,16 +2,18 @@
 
 A ball around a corner of a cell, with the generator of the cell on its surface, contains no generator. The reach of a
 cell is the distance of its farthest corner from its generator, and all these balls lie in the ball around the generator
-with twice this radius. So a cell is final if this part knows all generators in that ball. Each part tells the others
-the boxes that contain its generators, and asks those whose boxes meet its balls for the generators inside. If there are
-new ones, all parts make their cells again.
+with twice this radius. So a cell is final if this part knows all generators in that ball.
+
+Each part tells the others the boxes around its generators, and asks those whose boxes meet its balls for the generators
+inside. It asks for balls that are larger than necessary. So ghosts remain enough for some steps: as long as no ball has
+become larger than the one of the last request, and no generator has moved so far that it may have come into a ball of a
+part that does not know it (`sum_cells` in part.cl). Only then parts ask again. If there are new ghosts, all parts make
+their cells again.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pyopencl as cl
@@ -35,18 +37,23 @@ JUMP = 3
 """A new box begins where two successive generators on the curve are so many spacings apart."""
 CHUNK, CHUNKS = 16, 512
 """Least number of generators in a box, and largest number of boxes, that say where the generators of a part are."""
-SLACK = 1.05
-"""Factor on the radii of balls: with a few more ghosts the next diagrams need no further ones."""
+GROWTH, SKIN = 1.15, 0.15
+"""Radius of the balls that a part asks for, over that of the balls that its cells need. How far any other generator
+may come nearer before one may be in a ball without being known, as a share of this radius."""
+NEAR = 3
+"""Where generators of other parts are more than so many radii of the largest ball away, only boxes are compared."""
 NOISE = {"float64": 1e-6, "float32": 1e-4}
 """Bound of the round-off of a reach, as a share of it."""
 FILLED, MATCHED = {"float64": 1e-8, "float32": 1e-3}, {"float64": 1e-5, "float32": 1e-3}
 """Largest differences of the volume of all cells from that of the domain, and of both sides of faces between parts."""
 GROUP = 64
-"""Number of balls in a group. The box around a group is compared with the boxes of generators first."""
+"""Number of balls around ghosts in a box."""
+FAILED = np.array([0.0, 0.0, 0.0, 0.0, 1.0])
+"""Sums of a part whose update has failed; see `Part.sums`."""
 
 
 class Chunks:
-    """Boxes around generators that follow one another on a Hilbert curve.
+    """Generators that follow one another on a Hilbert curve.
 
     Parameters
     ----------
@@ -60,48 +67,139 @@ class Chunks:
         Generators along the curve.
     firsts : (k,) int
         Where the chunks begin in `order`.
+    place : (n,) int
+        Place of each generator in `order`.
     spacings : (n,) float
         For each generator the median distance of two successive ones in its chunk.
     """
 
     def __init__(self, points: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> None:
+        n = len(points)
         self.order = np.argsort(hilbert_keys(points, lower, upper), kind="stable")
-        count = max(1, min(CHUNKS, len(points) // CHUNK))
-        firsts = np.arange(count) * len(points) // count
+        count = max(1, min(CHUNKS, n // CHUNK))
+        firsts = np.arange(count) * n // count
         ways = np.linalg.norm(np.diff(points[self.order], axis=0), axis=1)
-        least = float(np.prod(upper - lower) / len(points)) ** (1 / len(lower)) / CHUNK
-        usual = [max(float(np.median(some)), least) if len(some) else least for some in np.split(ways, firsts[1:])]
-        spacings = np.repeat(usual, np.diff(np.append(firsts, len(points))))
-        self.spacings = np.empty(len(points))
-        self.spacings[self.order] = spacings
+        spacings = np.full(count, float(np.prod(upper - lower) / n) ** (1 / len(lower)) / CHUNK)
+        if n > count:
+            usual = np.median(ways[firsts[:, None] + np.arange(n // count - 1)], axis=1)
+            spacings = np.maximum(spacings, usual)
+        spacings = np.repeat(spacings, np.diff(np.append(firsts, n)))
+        self.spacings, self.place = np.empty(n), np.empty(n, int)
+        self.spacings[self.order], self.place[self.order] = spacings, np.arange(n)
         # Generators may have moved far from the others of their part.
         jumps = 1 + np.flatnonzero(ways > JUMP * spacings[:-1])
         self.firsts = np.unique(np.concatenate([firsts, jumps]))
-        self.move(points)
-
-    def move(self, points: np.ndarray) -> None:
-        """Set `boxes` (k, 2 d) to those of the present `points`: lower, then upper corners."""
-        sorted_points = points[self.order]
-        lower = np.minimum.reduceat(sorted_points, self.firsts, axis=0)
-        self.boxes = np.hstack([lower, np.maximum.reduceat(sorted_points, self.firsts, axis=0)])
-
-    def members(self, chunks: np.ndarray) -> np.ndarray:
-        """Return the generators of those `chunks` where it is True."""
-        return self.order[np.repeat(chunks, np.diff(np.append(self.firsts, len(self.order))))]
 
 
-def gaps2(points: np.ndarray, boxes: np.ndarray) -> np.ndarray:
-    """Return the squared distances of `points` (n, d) from `boxes` (k, 2 d), (n, k)."""
-    dim = points.shape[1]
-    below, above = boxes[None, :, :dim] - points[:, None], points[:, None] - boxes[None, :, dim:]
-    return (np.maximum(np.maximum(below, above), 0) ** 2).sum(axis=2)
+class BallGroups:
+    """The balls in which a part has to know all generators, in groups.
+
+    Parameters
+    ----------
+    centers : (m, d) float
+    radii : (m,) float
+    order : (m,) int
+        BallGroups of the groups, one group after the other.
+    firsts : (k,) int
+        Where groups begin in `order`.
+    own : int
+        Number of groups around generators of the part; the others are around ghosts.
+
+    Attributes
+    ----------
+    centers, radii : arrays
+        In this order.
+    boxes : (k, 2 d) float
+        Lower and upper corners of boxes around the centers of each group.
+    facts : (k, 2 d + 3) float
+        What other parts have to know: the boxes, the largest radius, the smallest skin, and whether the box is around
+        generators of the part.
+    """
+
+    def __init__(self, centers: np.ndarray, radii: np.ndarray, order: np.ndarray, firsts: np.ndarray, own: int) -> None:
+        self.centers, self.radii = centers[order], radii[order]
+        self.ends = np.append(firsts, len(order))
+        lower, upper = (f.reduceat(self.centers, firsts, axis=0) for f in (np.minimum, np.maximum))
+        self.largest = np.maximum.reduceat(self.radii, firsts)
+        skins = SKIN * np.minimum.reduceat(self.radii, firsts)
+        self.boxes = np.hstack([lower, upper])
+        self.facts = np.column_stack([self.boxes, self.largest, skins, np.arange(len(firsts)) < own])
+
+    def facing(self, facts: np.ndarray) -> Facing:
+        """Return how far these balls are from those of another part, which has sent its `facts` (k, 2 d + 3)."""
+        boxes, largest = facts[:, :-3], facts[:, -3]
+        away = gaps(self.boxes, around(boxes))[:, 0]
+        reach = np.where(
+            self.facts[:, -1] > 0, NEAR * np.maximum(self.largest, largest.max()), (1 + SKIN) * self.largest
+        )
+        near = np.flatnonzero(away <= reach)
+        groups, others = np.nonzero(gaps(self.boxes[near], boxes) <= reach[near, None])
+        groups = near[groups]
+        sizes = self.ends[groups + 1] - self.ends[groups]
+        places = np.repeat(self.ends[groups] - np.cumsum(sizes) + sizes, sizes) + np.arange(sizes.sum())
+        others = np.repeat(others, sizes)
+        dim, ways2 = self.centers.shape[1], np.zeros(len(places))
+        for axis in range(dim):
+            x = self.centers[places, axis]
+            way = np.maximum(np.maximum(boxes[others, axis] - x, x - boxes[others, dim + axis]), 0)
+            ways2 += way * way
+        away[near] = reach[near]
+        return Facing(facts, away, places, others, np.sqrt(ways2))
+
+    def wanted(self, facing: Facing) -> np.ndarray:
+        """Return the balls with their skins, (m, d + 1), in which the other part may have generators."""
+        radii = (1 + SKIN) * self.radii
+        holds = facing.facts[facing.others, -1] > 0
+        rows = np.unique(facing.places[holds & (facing.ways <= radii[facing.places])])
+        return np.column_stack([self.centers[rows], radii[rows]])
 
 
-def overlaps(boxes: np.ndarray, others: np.ndarray) -> Any:
-    """Return which of `boxes` (k, 2 d) meets each of `others` (m, 2 d), (k, m) bool."""
+@dataclass(frozen=True)
+class Facing:
+    """The balls of a part that are near boxes of another part.
+
+    Attributes
+    ----------
+    facts : (m, 2 d + 3) float
+        Of the boxes of the other part; see `BallGroups`.
+    away : (k,) float
+        Distance of each group from all boxes with which it has no pairs, or less.
+    places, others, ways : (p,) int, int, float
+        Pairs of a ball and a box, and the distances of its center from this box.
+    """
+
+    facts: np.ndarray
+    away: np.ndarray
+    places: np.ndarray
+    others: np.ndarray
+    ways: np.ndarray
+
+
+def gaps(boxes: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Return the distances between `boxes` (k, 2 d) and `others` (m, 2 d), (k, m)."""
     dim = boxes.shape[1] // 2
-    low = boxes[:, None, :dim] <= others[None, :, dim:]
-    return (low & (others[None, :, :dim] <= boxes[:, None, dim:])).all(axis=2)
+    ways = np.maximum(others[None, :, :dim] - boxes[:, None, dim:], boxes[:, None, :dim] - others[None, :, dim:])
+    return np.sqrt((np.maximum(ways, 0) ** 2).sum(axis=2))
+
+
+def around(boxes: np.ndarray) -> np.ndarray:
+    """Return the box around `boxes` (k, 2 d), (1, 2 d)."""
+    dim = boxes.shape[1] // 2
+    return np.concatenate([boxes[:, :dim].min(axis=0), boxes[:, dim:].max(axis=0)])[None]
+
+
+def inside(points: np.ndarray, balls: np.ndarray) -> np.ndarray:
+    """Return which of `points` (n, d) are in one of the `balls` (m, d + 1), (n,) bool.
+
+    With one more coordinate, sqrt(R^2 - r^2) of a ball with radius r <= R and 0 of a point, they are those that are
+    nearer than R to one of the centers.
+    """
+    radii = balls[:, -1]
+    largest = radii.max()
+    centers = np.column_stack([balls[:, :-1], np.sqrt(largest**2 - radii**2)])
+    places = np.column_stack([points, np.zeros(len(points))])
+    near, _ = scipy.spatial.cKDTree(centers).query(places, distance_upper_bound=largest * (1 + 1e-9))
+    return np.isfinite(near)
 
 
 class PartSteps(DomainSteps):
@@ -113,11 +211,13 @@ class PartSteps(DomainSteps):
     ----------
     rounds : int
         How often the cells of the latest diagram have been made.
+    asked : int
+        How often parts have asked each other for ghosts.
     """
 
     def __init__(self, stages: TessellationStages, domain: Domain) -> None:
         super().__init__(stages, domain)
-        self.peers, self.rounds = stages.engine.peers, 0
+        self.peers, self.rounds, self.asked = stages.engine.peers, 0, 0
         self._room = NamedArrays(stages.engine, spare=1 / 16)
         self._labels: cla.Array | None = None
 
@@ -133,53 +233,54 @@ class PartSteps(DomainSteps):
 
     def extend(self, sites: cla.Array, n: int) -> Part:
         """Return the generators, the first `n` of `sites`, with the ghosts that are known."""
-        labels = self._given
+        labels, engine = self._given, self.stages.engine
         self.rounds += 1
         if self.peers.count == 1:
             return Part(n, n, sites, self.box, None, labels=labels)
-        x = sites[:n].get().astype(float)
         if self._labels is not labels:
-            self._begin_anew(x, labels)
-        elif self.rounds == 1:
-            self._chunks.move(x)
-            self._meet()
-        self._x = x
+            self._begin_anew(sites[:n].get().astype(float), labels)
         count = n + len(self._rows)
-        points = self._room("points", size=count * self.stages.engine.dim).reshape(count, -1)
-        cl.enqueue_copy(self.stages.engine.queue, buffer_of(points), buffer_of(sites), byte_count=sites[:n].nbytes)
-        self._ghosts.fill(self.stages.engine, n, points)
+        points = self._room("points", size=count * engine.dim).reshape(count, -1)
+        cl.enqueue_copy(engine.queue, buffer_of(points), buffer_of(sites), byte_count=sites[:n].nbytes)
+        self._ghosts.fill(engine, n, points)
+        if self._at is None:
+            self._note(points)
         return Part(n, count, points, self.box, self._ghosts, labels=self._all_labels)
 
     def _begin_anew(self, x: np.ndarray, labels: cla.Array) -> None:
         """Ask for the ghosts of new generators."""
         engine, count = self.stages.engine, self.peers.count
-        lower, upper = (corner[: engine.dim].astype(float) for corner in self.box.device_corners(engine.real))
-        self._labels, self._chunks = labels, Chunks(x, lower, upper)
+        self._corners = [corner[: engine.dim].astype(float) for corner in self.box.device_corners(engine.real)]
+        self._labels, self._chunks = labels, Chunks(x, *self._corners)
         self._sent = [np.empty(0, np.int32) for _ in range(count)]
         self._parts, self._rows = np.empty(0, int), np.empty(0, np.int32)
         self._caps = FIRST_REACH[self._reads_rows] * self._chunks.spacings
-        self._x = x
-        self._meet()
-        self._ask(x, self._caps, np.empty((0, engine.dim)), np.empty(0))
+        self._ask(x, np.empty(0, int), self._caps)
         self._store()
 
-    def _meet(self) -> None:
-        """Tell the others where the generators are."""
-        self._boxes = self.peers.exchange([self._chunks.boxes] * self.peers.count)
-
     def _store(self) -> None:
-        """Upload the lists of ghosts, and get from their owners their labels and the largest radii of their balls."""
-        engine, n = self.stages.engine, len(self._x)
+        """Upload the lists of ghosts, and get from their owners their labels and the radii of their balls."""
+        engine, n = self.stages.engine, len(self._chunks.order)
         order = np.argsort(self._parts, kind="stable")
         self._parts, self._rows = self._parts[order], self._rows[order]
         self._ghosts = Ghosts.of_lists(engine, self.peers, self._parts, self._rows, self._sent)
         assert self._labels is not None
-        labels = np.empty(n + len(self._rows), np.int32)
-        labels[:n] = self._labels.get()[:n]
-        labels[n:] = np.concatenate(self.peers.exchange([labels[rows] for rows in self._sent]))
-        self._all_labels = engine.upload(labels, np.int32)
-        caps = self._caps[:n]
-        self._caps = np.concatenate([caps, *self.peers.exchange([caps[rows] for rows in self._sent])])
+        labels, caps = self._labels.get()[:n], self._caps[:n]
+        known = [np.column_stack([labels[rows], caps[rows]]) for rows in self._sent]
+        found = np.concatenate(self.peers.exchange(known))
+        self._all_labels = engine.upload(np.concatenate([labels, found[:, 0].astype(np.int32)]), np.int32)
+        self._caps = np.concatenate([caps, found[:, 1]])
+        # Cells next to new ghosts may need more.
+        self._limits = np.pad(self._limits[:n], ((0, len(self._rows)), (0, 0)))
+        self._limits[n:, 1] = np.inf
+
+    def _note(self, points: cla.Array) -> None:
+        """Note the positions, in `points` (count, d), of the last request for ghosts."""
+        engine = self.stages.engine
+        self._at = self._room("at", size=points.size).reshape(points.shape)
+        cl.enqueue_copy(engine.queue, buffer_of(self._at), buffer_of(points), byte_count=points.nbytes)
+        # Rounded towards smaller ones.
+        self._limits_there = engine.upload(self._limits * (1 - 1e-6), np.float32)
 
     def builds_all(self, part: Part, complete: bool, enough: bool) -> bool:
         """Return whether ghosts get cells: in 2D, where the descent of shapes reads the rows of neighbors."""
@@ -203,49 +304,45 @@ class PartSteps(DomainSteps):
         part = self.extend(sites, n)
         before = previous.whole or previous
         t = stages.update.update(stages.cells, self.box, part.points, before, clip=None)
-        if self.peers.any(t is None) or t is None:
-            return None
-        part.order_rows(stages.engine, t, stages.cells.defines)
-        made = self.finish(part, t, sites, False, True)
+        if t is not None:
+            part.order_rows(stages.engine, t, stages.cells.defines)
+        made = self._finished(part, t)
         if made is not None:
             follow(made, None)
         return made
 
     def finish(self, part: Part, t: Tessellation, points: cla.Array, exact: bool, nearest: bool) -> Tessellation | None:
         """Return `t` if its cells, and in 2D those of neighbors, are final; None if ghosts were missing."""
+        return self._finished(part, t)
+
+    def _finished(self, part: Part, t: Tessellation | None) -> Tessellation | None:
+        """Return the diagram of own cells, if `t` is one in all parts, and no ghosts were missing."""
+        engine, n, sums = self.stages.engine, part.n_own, FAILED
         if part.ghosts is None:
-            return replace(t, part=part)
-        engine, n = self.stages.engine, part.n_own
-        assert t.reach is not None
-        reach = t.reach.get().astype(float) * (2 * (1 + NOISE[engine.real.name]))
-        ghosts, away = np.empty(0, int), np.empty((0, engine.dim))
-        if self._reads_rows:
-            ghosts = part.neighboring_ghosts(engine, t)
-            away = part.points.get()[ghosts].astype(float)
-        while True:
-            caps = self._caps[: part.count]
-            radii = np.minimum(reach[:n], caps[:n]), np.minimum(reach[ghosts], caps[ghosts])
-            found = self._ask(self._x, radii[0], away, radii[1])
-            state = self.peers.total(
-                np.array([found, (reach[:n] > caps[:n]).any() or (reach[ghosts] > caps[ghosts]).any()])
-            )
-            if state[0]:
-                self._caps = 2 * caps
-                self._store()
-                return None
-            if not state[1]:
-                break
-            self._caps = 2 * caps
-        own = t.first(n) if t.n > n else t
-        self._check(part.sums(engine, own))
+            return None if t is None else replace(t, part=part)
+        marks = engine.scratch(part.count, np.int32)
+        if t is not None:
+            assert t.reach is not None
+            assert self._at is not None
+            if self._reads_rows:
+                part.mark_neighbors(engine, t, marks)
+            ghosts = (marks, part.count) if self._reads_rows else (marks, n)
+            given = t.reach, self._at, self._limits_there, 2 * (1 + NOISE[engine.real.name])
+            sums = np.append(part.sums(engine, t, *ghosts, *given), 0)
+        sums = self.peers.total(sums)
+        if sums[-1] or t is None:
+            return None
+        if sums[3] and not self._ask_again(part, t, marks):
+            return None
+        self._check(*sums[:3])
         whole = t if t.n == part.count else None
+        own = t.first(n) if t.n > n else t
         return replace(own, part=part, whole=whole, points=part.points, sites=part.points)
 
-    def _check(self, sums: np.ndarray) -> None:
+    def _check(self, volume: float, gap: float, faces: float) -> None:
         """Raise if the cells of all parts do not fill the domain, or faces between parts have one side."""
         real = self.stages.engine.real
         corners = self.box.device_corners(real)
-        volume, gap, faces = self.peers.total(sums)
         measure = float(np.prod((corners[1] - corners[0])[: self.domain.dim].astype(float)))
         off = abs(volume / measure - 1)
         if off > FILLED[real.name] or abs(gap) > MATCHED[real.name] * faces:
@@ -254,55 +351,101 @@ class PartSteps(DomainSteps):
                 f"{abs(gap) / max(faces, 1e-300):.2g} of their area, expected none: ghosts are missing"
             )
 
-    def _ask(self, x: np.ndarray, radii: np.ndarray, more: np.ndarray, more_radii: np.ndarray) -> int:
-        """Ask for the generators in balls around `x` (n, d) and `more` (k, d); return how many ghosts are new."""
-        balls = [np.empty((0, x.shape[1] + 1)) for _ in self._boxes]
-        for part, boxes in enumerate(self._boxes):
-            if part != self.peers.number:
-                balls[part] = self._near(boxes, x, radii, more, more_radii)
-        wanted = self.peers.exchange(balls)
-        found = [self._inside(given, sent) for given, sent in zip(wanted, self._sent, strict=True)]
+    def _ask_again(self, part: Part, t: Tessellation, marks: cla.Array) -> bool:
+        """Ask for ghosts as the cells of `t` need them; return whether there are no new ones."""
+        n, x = part.n_own, part.points.get().astype(float)
+        ghosts = np.empty(0, int)
+        if self._reads_rows:
+            ghosts = n + np.flatnonzero(marks.get()[n:])
+        rows = np.concatenate([np.arange(n), ghosts])
+        assert t.reach is not None
+        needed = t.reach.get()[rows].astype(float) * (2 * (1 + NOISE[self.stages.engine.real.name]))
+        while True:
+            # A cell without the ghosts around it may reach through the whole domain.
+            radii = np.minimum(GROWTH * needed, 2 * self._caps[rows])
+            found = self._ask(x, ghosts, radii)
+            self._caps[rows] = np.maximum(self._caps[rows], radii)
+            new, short = self.peers.total(np.array([found, (needed > radii).any()]))
+            if new:
+                self._store()
+                return False
+            if not short:
+                self._note(part.points)
+                return True
+
+    def _ask(self, x: np.ndarray, ghosts: np.ndarray, radii: np.ndarray) -> int:
+        """Ask for the generators in balls around own generators and `ghosts`, and return how many ghosts are new.
+
+        Parameters
+        ----------
+        x : (n or more, d) float
+            Positions of the generators, and of ghosts.
+        ghosts : (k,) int
+            Rows in `x`.
+        radii : (n + k,) float
+        """
+        self.asked += 1
+        own, n = self._chunks, len(self._chunks.order)
+        order = np.argsort(hilbert_keys(x[ghosts], *self._corners), kind="stable")
+        order = np.concatenate([own.order, n + order])
+        firsts = np.concatenate([own.firsts, np.arange(n, len(radii), GROUP)])
+        centers = np.concatenate([x[:n], x[ghosts]])
+        balls = BallGroups(centers, radii, order, firsts, len(own.firsts))
+        told = self.peers.exchange([balls.facts] * self.peers.count)
+        others = [number for number in range(self.peers.count) if number != self.peers.number]
+        facing = {number: balls.facing(told[number]) for number in others}
+        wanted = [np.empty((0, x.shape[1] + 1))] * self.peers.count
+        for number in others:
+            wanted[number] = balls.wanted(facing[number])
+        wanted = self.peers.exchange(wanted)
+        found = [self._unknown(balls, given, sent) for given, sent in zip(wanted, self._sent, strict=True)]
         self._sent = [np.concatenate(pair) for pair in zip(self._sent, found, strict=True)]
         new = self.peers.exchange(found)
         self._parts = np.concatenate([self._parts, np.repeat(np.arange(len(new)), [len(rows) for rows in new])])
         self._rows = np.concatenate([self._rows, *new])
+        self._limits = np.full((len(x), 2), np.inf)
+        self._limits[n:, 0] = 0
+        self._limits[ghosts, 0] = radii[n:]
+        self._limits[own.order] = np.column_stack(self._limits_of(balls, facing))
+        self._at = None
         return sum(map(len, new))
 
-    def _near(
-        self, boxes: np.ndarray, x: np.ndarray, radii: np.ndarray, more: np.ndarray, more_radii: np.ndarray
-    ) -> np.ndarray:
-        """Return the balls (m, d + 1) that meet one of the `boxes` (k, 2 d) of another part."""
-        chunks, dim = self._chunks, x.shape[1]
-        largest = np.maximum.reduceat(radii[chunks.order], chunks.firsts)[:, None]
-        grown = chunks.boxes + np.hstack([-largest] * dim + [largest] * dim)
-        meet = overlaps(grown, boxes)
-        ends, found = np.append(chunks.firsts, len(chunks.order)), []
-        for c in np.flatnonzero(meet.any(axis=1)):
-            rows = chunks.order[ends[c] : ends[c + 1]]
-            near = (gaps2(x[rows], boxes[meet[c]]) <= radii[rows, None] ** 2).any(axis=1)
-            found.append(rows[near])
-        rows = np.concatenate([np.empty(0, int), *found])
-        given = [np.column_stack([x[rows], SLACK * radii[rows]])]
-        for first in range(0, len(more), 4096):
-            places, reach = more[first : first + 4096], more_radii[first : first + 4096]
-            near = (gaps2(places, boxes) <= reach[:, None] ** 2).any(axis=1)
-            given.append(np.column_stack([places[near], SLACK * reach[near]]))
-        return np.concatenate(given)
-
-    def _inside(self, balls: np.ndarray, known: np.ndarray) -> np.ndarray:
-        """Return the generators in `balls` (m, d + 1) that are not among the `known` ones, (k,) int32."""
+    def _unknown(self, own: BallGroups, balls: np.ndarray, known: np.ndarray) -> np.ndarray:
+        """Return the own generators in `balls` (m, d + 1) that are not among the `known` ones, (k,) int32."""
         if not len(balls):
             return np.empty(0, np.int32)
-        centers, radii = balls[:, :-1], balls[:, -1:]
+        chunks, dim = self._chunks, balls.shape[1] - 1
         firsts = np.arange(0, len(balls), GROUP)
-        lower = np.minimum.reduceat(centers - radii, firsts, axis=0)
-        groups = np.hstack([lower, np.maximum.reduceat(centers + radii, firsts, axis=0)])
-        rows = self._chunks.members(overlaps(self._chunks.boxes, groups).any(axis=1))
-        rows = np.setdiff1d(rows, known)
-        if not len(rows):
-            return np.empty(0, np.int32)
-        lists: Sequence = scipy.spatial.cKDTree(self._x[rows]).query_ball_point(
-            centers, radii[:, 0], return_sorted=False
-        )
-        places = np.unique(np.concatenate([np.asarray(some, int) for some in lists]))
-        return rows[places].astype(np.int32)
+        lower = np.minimum.reduceat(balls[:, :dim] - balls[:, dim:], firsts, axis=0)
+        groups = np.hstack([lower, np.maximum.reduceat(balls[:, :dim] + balls[:, dim:], firsts, axis=0)])
+        near = (gaps(own.boxes[: len(chunks.firsts)], groups) <= 0).any(axis=1)
+        places = np.flatnonzero(np.repeat(near, np.diff(np.append(chunks.firsts, len(chunks.order)))))
+        rows = chunks.order[places]
+        unknown = ~np.isin(rows, known)
+        rows, places = rows[unknown], places[unknown]
+        return rows[inside(own.centers[places], balls)].astype(np.int32) if len(rows) else np.empty(0, np.int32)
+
+    def _limits_of(self, balls: BallGroups, facing: dict[int, Facing]) -> tuple[np.ndarray, np.ndarray]:
+        """Return the limits of own generators along the curve, (n,) each; see `is_within_limits` in part.cl.
+
+        A generator that another part does not know has the distance of a skin from each ball of it at least. The
+        radius of a ball far from all others is half their distance.
+        """
+        chunks = self._chunks
+        n, k = len(chunks.order), len(chunks.firsts)
+        sizes = np.diff(balls.ends)[:k]
+        free, room = np.full(n, np.inf), np.full(n, np.inf)
+        for number, f in facing.items():
+            largest, skins, holds = f.facts[:, -3], f.facts[:, -2], f.facts[:, -1] > 0
+            away = f.away[:k]
+            ways, rooms = (
+                np.repeat(values, sizes)
+                for values in (away, np.maximum(skins.min(), away - np.maximum(largest.max(), away / 2)))
+            )
+            own = f.places < n
+            places, to, gap = f.places[own], f.others[own], f.ways[own]
+            np.minimum.at(ways, places[holds[to]], gap[holds[to]])
+            np.minimum.at(rooms, places, np.maximum(skins[to], gap - np.maximum(largest[to], gap / 2)))
+            rooms[chunks.place[self._sent[number]]] = np.inf
+            free, room = np.minimum(free, ways / 2), np.minimum(room, rooms)
+        return np.maximum(balls.radii[:n], free), room
