@@ -255,7 +255,7 @@ class Ranks(Peers):
         while not self._alarms.Iprobe(part, tag):
             if time.monotonic() > latest:
                 return None
-            time.sleep(50 * NAP)
+            time.sleep(NAPS[1])
         return int(self._alarms.recv(source=part, tag=tag))
 
 
