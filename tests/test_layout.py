@@ -55,10 +55,8 @@ UPWARD = {
     ("mesh.output", "io"),
     ("mesh.output", "plotting"),
     ("mesh.output", "remapping"),
-    ("opencl.peers", "__init__"),
 }
-"""Imports against the order, all inside methods: of `Result`, `Diagram` and `Measures` (save, plot, check, transfer),
-and of `Peers` (the version)."""
+"""Imports against the order, all inside methods of `Result`, `Diagram` and `Measures`: save, plot, check, transfer."""
 MOST_IN_ROOT, MOST_IN_PACKAGE = 12, 25
 """Files directly in `clvoro/`, and in each of its folders."""
 DOMAINS = {"Box", "Polygon", "Sphere", "SphereRegion"}
