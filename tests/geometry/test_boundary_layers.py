@@ -383,13 +383,13 @@ def test_new_generators_keep_away_from_layers_around_corners(ctx, dtype):
 def test_layers_thicker_than_their_gap_are_refused_with_a_thickness_that_fits(ctx):
     channel = clvoro.Polygon([(0, 0), (4, 0), (4, 1), (0, 1)], [clvoro.curves.circle((1, 0.5), 0.2, name="pipe")])
     for edges in ("pipe", None):
-        layers = Layers(0.005, count=16, growth=1.3, edges=edges)
+        layers = Layers(0.05, count=8, growth=1.3, edges=edges)
         with pytest.raises(
-            InputError, match=r"layers\[0\] are 1.09 thick, and the gap at .* is ([\d.]+) wide"
+            InputError, match=r"layers\[0\] are 1.19 thick, and the gap at .* is ([\d.]+) wide"
         ) as raised:
             clvoro.Adapter(ctx).run(channel, 0.1, layers=layers)
         fits = float(re.search("at most ([0-9.]+)", str(raised.value))[1])
-        thinner = Layers(0.005 * fits / layers.thickness, count=16, growth=1.3, spacing=0.05, edges=edges)
+        thinner = Layers(0.05 * fits / layers.thickness, count=8, growth=1.3, spacing=0.1, edges=edges)
         result = clvoro.Adapter(ctx).run(channel, 0.1, "fast", layers=thinner)
         assert np.abs(result.size_error).mean() < 0.05
     # The place is in the throat, not in a sharp corner, where gaps are ever narrower.
