@@ -19,6 +19,7 @@ from .files import open_plain
 from .foam.case import FoamCase
 from .foam.mesh import FoamMesh
 from .geometry.domain import Domain
+from .geometry.sphere import Sphere
 from .io import load
 from .io.arrays import FileError, array_names, explained, is_kind, read_array
 from .io.npz import FORMAT
@@ -194,12 +195,12 @@ def _of_openfoam(path: Path, wanted: tuple[str, ...] | None, time: float | None)
             raise FileError(f"it has no time {time:g}; it has {', '.join(one.name for one in there)}")
         at = same[0]
     foam = FoamMesh.read(case.mesh_folder(at))
+    dim = 2 if foam.is_plane else 3
     known = {one.name: one for one in case.fields(at) if one.in_cells}
     values = {}
     for name in _chosen(wanted, known):
-        rows = known[name].internal.rows(foam.n_cells)
+        rows = _of_dimension(known[name].internal.rows(foam.n_cells), dim)
         values[name] = rows[:, 0] if rows.shape[1] == 1 else rows
-    dim = 2 if foam.is_plane else 3
     return _Found(values, foam.centroids[:, :dim], domain=_domain_of(foam))
 
 
@@ -293,7 +294,7 @@ def _of_arrays(path: Path, wanted: tuple[str, ...] | None, time: float | None) -
 def _of_netcdf(path: Path, wanted: tuple[str, ...] | None, time: float | None) -> _Found:
     with open_netcdf(path) as file:
         there = {name: found for name in file.names() if (found := _coordinates(file, name))}
-        axes = {name for axes, _, _ in there.values() for name in axes}.union(_MPAS_PLACES)
+        axes = {name for found in there.values() for name in found.names}.union(_MPAS_PLACES)
         kinds = "f" if wanted is None else "iuf"
         present = [name for name in there if name not in axes and file.kind(name) in kinds]
         if not present:
@@ -301,45 +302,95 @@ def _of_netcdf(path: Path, wanted: tuple[str, ...] | None, time: float | None) -
                 "it has no fields by UGRID or MPAS, nor with the attribute coordinates; for sizes on a grid of "
                 'longitudes and latitudes take Raster, or kind = "raster" in a case file'
             )
-        values = {name: _at_time(file, name, there[name][1], time) for name in _chosen(wanted, present)}
+        values = {name: _at_time(file, name, there[name].along, time) for name in _chosen(wanted, present)}
         used = {there[name] for name in values}
         if len(used) > 1:
             raise FileError(f"its fields {', '.join(values)} are at different places; read them one after the other")
-        names, _, on_globe = used.pop()
-        places = np.stack([file.data(name) for name in names], axis=1)
-        if names[0] == "lonCell":
-            places = np.degrees(places)
+        coordinates = used.pop()
+        places = _places(file, coordinates)
     kept = ~np.any([np.isnan(v.reshape(len(v), -1)).any(axis=1) for v in (places, *values.values())], axis=0)
     if not kept.any():
         raise FileError(f"its fields {', '.join(values)} have no values")
-    return _Found({name: v[kept] for name, v in values.items()}, places[kept], on_globe)
+    return _Found({name: v[kept] for name, v in values.items()}, places[kept], coordinates.on_globe)
 
 
-def _coordinates(file: Variables, name: str) -> tuple[tuple[str, ...], str, bool] | None:
-    """Return where the values of a variable are; None if the file does not say it.
+class _Coordinates(NamedTuple):
+    """Where the values of a variable are.
 
-    Returns the names of the variables with the coordinates, the name of their dimension, and whether they are
-    longitudes and latitudes.
+    Attributes
+    ----------
+    names : tuple of str
+        The variables with the coordinates.
+    along : str
+        The dimension of the values that counts places.
+    on_globe : bool
+        Whether the coordinates are longitudes and latitudes.
+    corners : str
+        By UGRID the variable with the nodes of each face or edge, if only nodes have coordinates.
     """
+
+    names: tuple[str, ...]
+    along: str
+    on_globe: bool
+    corners: str = ""
+
+
+def _coordinates(file: Variables, name: str) -> _Coordinates | None:
+    """Return where the values of a variable are; None if the file does not say it."""
     dims = file.dimensions(name)
     sphere = str(file.attribute("on_a_sphere")).strip().upper() == "YES"
     cells = ("lonCell", "latCell") if sphere else ("xCell", "yCell")
     if "nCells" in dims and all(one in file for one in cells):
-        return cells, "nCells", sphere
+        return _Coordinates(cells, "nCells", sphere)
     texts = [file.about(name, "coordinates")]
-    mesh = file.about(name, "mesh")
+    mesh, location = file.about(name, "mesh"), file.about(name, "location")
     if mesh is not None and mesh in file:
-        texts.append(file.about(mesh, f"{file.about(name, 'location')}_coordinates"))
+        texts.append(file.about(mesh, f"{location}_coordinates"))
     for text in texts:
-        known = tuple(one for one in str(text or "").split() if one in file and len(file.dimensions(one)) == 1)
-        along = {file.dimensions(one)[0] for one in known}
-        if len(along) == 1 and along <= set(dims):
-            lonlat = lonlat_names(file, " ".join(known))
-            if lonlat is not None:
-                return lonlat, along.pop(), True
-            if 2 <= len(known) <= 3:
-                return known, along.pop(), False
-    return None
+        found = _named(file, text)
+        if found is not None and found.along in dims:
+            return found
+    if mesh is None or mesh not in file:
+        return None
+    corners = str(file.about(mesh, f"{location}_node_connectivity"))
+    nodes = _named(file, file.about(mesh, "node_coordinates"))
+    if nodes is None or corners not in file:
+        return None
+    along = str(file.about(mesh, f"{location}_dimension") or file.dimensions(corners)[0])
+    return nodes._replace(along=along, corners=corners) if along in dims else None
+
+
+def _named(file: Variables, text: object) -> _Coordinates | None:
+    """Return the coordinates that an attribute names; None if they are not two or three of one dimension."""
+    known = tuple(one for one in str(text or "").split() if one in file and len(file.dimensions(one)) == 1)
+    along = {file.dimensions(one)[0] for one in known}
+    if len(along) != 1:
+        return None
+    lonlat = lonlat_names(file, " ".join(known))
+    if lonlat is not None:
+        return _Coordinates(lonlat, along.pop(), True)
+    return _Coordinates(known, along.pop(), False) if 2 <= len(known) <= 3 else None
+
+
+def _places(file: Variables, coordinates: _Coordinates) -> np.ndarray:
+    """Return the places of values, (n, k), longitudes and latitudes in degrees; of faces the mean of their corners."""
+    places = np.stack([file.data(name) for name in coordinates.names], axis=1)
+    if coordinates.names[0] == "lonCell":
+        places = np.degrees(places)
+    if not coordinates.corners:
+        return places
+    table = file.data(coordinates.corners)
+    if file.dimensions(coordinates.corners)[0] != coordinates.along:
+        table = table.T
+    first = int(np.ravel(file.about(coordinates.corners, "start_index") or 0)[0])
+    there = (table >= first) & (table < first + len(places))
+    if not there.any(axis=1).all():
+        raise FileError(f"{coordinates.corners} has a row without nodes, expected numbers from {first}")
+    globe = Sphere(1.0)
+    x = globe.positions(places) if coordinates.on_globe else places
+    corners = x[np.where(there, table, first).astype(int) - first]
+    middles = (corners * there[..., None]).sum(axis=1) / there.sum(axis=1)[:, None]
+    return globe.lonlat(middles) if coordinates.on_globe else middles
 
 
 def _at_time(file: Variables, name: str, along: str, time: float | None) -> np.ndarray:
@@ -382,6 +433,12 @@ def _of_meshio(path: Path, wanted: tuple[str, ...] | None, time: float | None) -
             f"meshio cannot read it ({why:.200}); write a table of points, .csv with the columns x, y (, z), as "
             "ParaView does with its filter Cell Centers"
         ) from error
+    if not mesh.cells and not mesh.point_data:
+        why = " ".join(said.getvalue().split())
+        raise FileError(
+            f"meshio finds no cells and no values at points in it ({why or 'it is empty'}); write a table of points, "
+            ".csv with the columns x, y (, z), as ParaView does with its filter Cell Centers"
+        )
     top = max((block.dim for block in mesh.cells), default=0)
     blocks = [k for k, block in enumerate(mesh.cells) if block.dim == top]
     in_cells = {name: [parts[k] for k in blocks] for name, parts in mesh.cell_data.items()}

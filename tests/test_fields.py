@@ -135,6 +135,41 @@ def test_fields_on_a_sphere(globe, tmp_path, convention):
     assert north.sum() < 0.7 * (~north).sum()
 
 
+@pytest.mark.parametrize("on_globe", [False, True])
+def test_faces_whose_corners_alone_have_coordinates(tmp_path, on_globe):
+    """By UGRID: counted from 1, rows that are filled up, and on the globe faces across the date line."""
+    globe = clvoro.Sphere(1.0)
+    x = globe.icosahedral_points(1) if on_globe else grid(2)
+    corners = scipy.spatial.ConvexHull(x).simplices if on_globe else scipy.spatial.Delaunay(x).simplices
+    middle = x[corners].mean(axis=1)
+    middle /= np.linalg.norm(middle, axis=1)[:, None] if on_globe else 1
+    file = scipy.io.netcdf_file(tmp_path / "m.nc", "w")
+    for name, size in (("node", len(x)), ("face", len(corners)), ("side", 4)):
+        file.createDimension(name, size)
+    filled = np.pad(corners.astype(np.int32) + 1, ((0, 0), (0, 1)), constant_values=-1)
+    plane = globe.lonlat(x) if on_globe else x
+    for name, kind, dims, values in (
+        ("lon", "d", ("node",), plane[:, 0]),
+        ("lat", "d", ("node",), plane[:, 1]),
+        ("table", "i", ("side", "face"), filled.T),
+        ("u", "d", ("face",), middle[:, -1]),
+        ("topology", "i", (), 0),
+    ):
+        file.createVariable(name, kind, dims)[...] = values
+    if on_globe:
+        file.variables["lon"].units, file.variables["lat"].units = "degrees_east", "degrees_north"
+    else:
+        file.variables["lon"].units = file.variables["lat"].units = "m"
+    file.variables["table"].start_index, file.variables["table"]._FillValue = 1, -1
+    for key, text in (("node_coordinates", "lon lat"), ("face_node_connectivity", "table"), ("face_dimension", "face")):
+        setattr(file.variables["topology"], key, text)
+    file.variables["u"].mesh, file.variables["u"].location = "topology", "face"
+    file.close()
+    found, values = clvoro.read_fields(tmp_path / "m.nc", "u", domain=globe if on_globe else SQUARE)
+    assert len(found) == len(corners)
+    assert values["u"] == pytest.approx(found.points[:, -1], abs=1e-9)
+
+
 def write_ocean(path):
     """Longitudes and latitudes at three times, without values on land."""
     lon, lat = np.meshgrid(np.arange(5.0, 365, 10), np.arange(-85.0, 90, 10))
@@ -226,6 +261,16 @@ def test_tables_of_other_programs(tmp_path):
         assert x.tolist() == [[u, 1] for u in x[:, 0]]
         found, values = table(labels, fields="u")(tmp_path)
         assert values["u"].tolist() == x[:, 0].tolist() == pytest.approx(found.points.sum(axis=1))
+
+
+def test_cells_that_meshio_does_not_know(tmp_path):
+    """VTK's voxels, of which a grid is made."""
+    corners = " ".join(map(str, range(8)))
+    points = " ".join(f"{x} {y} {z}" for z in (0, 1) for y in (0, 1) for x in (0, 1))
+    text = f"# vtk DataFile Version 3.0\ngrid\nASCII\nDATASET UNSTRUCTURED_GRID\nPOINTS 8 float\n{points}\n"
+    (tmp_path / "g.vtk").write_text(f"{text}CELLS 1 9\n8 {corners}\nCELL_TYPES 1\n11\n")
+    with pytest.raises(InputError, match="Cell Centers"):
+        clvoro.read_fields(tmp_path / "g.vtk", domain=CUBE)
 
 
 def test_files_that_are_damaged(tmp_path, capfd):
