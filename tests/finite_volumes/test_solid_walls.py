@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import scipy
 from scipy.spatial import ConvexHull
 
 import clvoro
@@ -71,6 +72,15 @@ def made(request, ctx):
     diagram = solid_diagram(WallSurface(solid), x, h, lambda x: whole_faces(ctx, solid, x, h))
     assert np.array_equal(diagram.home, np.arange(len(x)))
     return solid, diagram.faces
+
+
+def test_outer_generators_of_a_lattice_differ():
+    """Those of two generators behind each other would be at the same place."""
+    x = np.stack(np.meshgrid(*[np.arange(0.1, high, 0.2) for high in (1.2, 1, 1)], indexing="ij"), axis=-1)
+    x = x.reshape(-1, 3)
+    placed = outer_generators(WallSurface(SOLIDS["cube"]()), x, np.full(len(x), 0.2001))
+    assert len(placed) > 100
+    assert scipy.spatial.KDTree(placed).query(placed, 2)[0][:, 1].min() > 0.1
 
 
 def sides_of_cells(faces):

@@ -30,6 +30,8 @@ _CERTAIN = 0.3
 """Vertices are not examined if the depths of their generators show that they are deeper than this share of h."""
 _CLEAR = 1.4
 """Least distance of outer generators from the whole surface, over h: no cell is that wide at a wall."""
+_SAME = 1e-3
+"""Outer generators are the same if they are nearer to each other than this share of the least h."""
 EXACT, FILLED, ROUNDED = range(3)
 """How the walls of a cell are made: with all creases; without concave creases; without creases.
 
@@ -95,7 +97,12 @@ def outer_generators(surface: WallSurface, points: np.ndarray, sizes: np.ndarray
     normal *= np.where(distance > 0, -1, 1)[:, None]
     placed = foot + OUTSIDE * h[:, None] * normal
     clear = surface.closest(placed)[2] > _CLEAR * h
-    return placed[clear]
+    placed, h = placed[clear], h[clear]
+    if not len(placed):
+        return placed
+    # Generators of a lattice behind each other have the same point.
+    twice = scipy.spatial.KDTree(placed).query_pairs(_SAME * float(h.min()), output_type="ndarray")
+    return np.delete(placed, twice[:, 1], axis=0)
 
 
 def off_middle(surface: WallSurface, points: np.ndarray, sizes: np.ndarray) -> np.ndarray:
