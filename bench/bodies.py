@@ -1,17 +1,22 @@
 """Drag of bodies with OpenFOAM against cells: on uniform meshes, graded by hand, and adapted to the solution.
 
-    python bench/bodies.py [--flow airfoil|sphere] [--uniform LIST] [--graded LIST] [--adapted LIST] [--first N]
-                           [--cycles 4] [--samples 1] [--reference LIST] [--pictures FOLDER] [--device NAME] [--json]
+    python bench/bodies.py [--flow airfoil|sphere] [--uniform LIST] [--graded LIST] [--wake LIST] [--adapted LIST]
+                           [--first N] [--goal forces|velocity] [--cycles 4] [--samples 1] [--reference LIST]
+                           [--velocity N] [--pictures FOLDER] [--device NAME] [--json]
 
 airfoil: a NACA 0012 section without incidence at Re 1000, in a square of 20 chords. sphere: Re 100, in a box of
 16 x 12 x 12 diameters. The sides of the box slip. The flow is laminar and steady (`simpleFoam`).
 
 "Graded" has sizes that grow from the body, by a share of the distance; the size at the body follows from the number of
 cells. "Adapted" begins with a uniform mesh of --first cells, in which the body is as small as a cell or smaller;
-`clvoro.foam.adapt_case` makes --cycles meshes for the forces on the body (`FieldSizes(forces="body")`). No place is
-named, no size is given. Errors are those of the coefficient of drag in percent of a reference. With --samples several
-meshes are made for each row, with counts that differ by one percent and with other seeds: shown are the median and the
-range.
+`clvoro.foam.adapt_case` makes --cycles meshes for the forces on the body (`FieldSizes(forces="body")`), or with
+`--goal velocity` for the L2 error of the velocity (`FieldSizes()`). No place is named, no size is given. Errors are
+those of the coefficient of drag in percent of a reference. With --samples several meshes are made for each row, with
+counts that differ by one percent and with other seeds: shown are the median and the range.
+
+With --velocity "u %" is the L2 error of the velocity, linear between the cells, in percent of the norm of what the body
+changes of the stream. It has no sign, so that two errors do not cancel. The reference is the flow on a mesh of N cells:
+around the airfoil as "wake", around the sphere a structured one, within three diameters of the axis.
 
 --reference, such as 3000,12000,48000, finds the reference: on structured meshes of quadrilaterals between the body and
 the box, whose angles and ratios of radii are uniform; around the airfoil in the plane in which its chord is a circle.
@@ -33,12 +38,14 @@ from typing import Any
 import numpy as np
 from _common import FIRST_SEED, Report, counts, heading, make_adapter, parser, spread
 from _openfoam import Case, forces_on, require, write_prisms
+from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
 
 import clvoro
 from clvoro import foam, sizing
 from clvoro.foam.case import FoamCase
 from clvoro.geometry.domain import Domain
 
+GOALS = {"forces": foam.FieldSizes(forces="body"), "velocity": foam.FieldSizes()}
 STEPS = 1500
 """Most iterations on one mesh."""
 WEDGE = 0.1
@@ -67,6 +74,8 @@ class Flow:
         Numbers of cells by kind of mesh.
     window : tuple
         Part of a picture.
+    reach : float
+        Distance from the axis up to which errors of the velocity count.
     """
 
     domain: Callable[[], Domain]
@@ -78,6 +87,7 @@ class Flow:
     lines: Callable[[], tuple[np.ndarray, np.ndarray, Callable[[np.ndarray], np.ndarray]]]
     cells: dict[str, str]
     window: tuple[tuple[float, float], tuple[float, float]]
+    reach: float
 
 
 def around_airfoil() -> clvoro.Polygon:
@@ -137,8 +147,9 @@ FLOWS = {
         0.15,
         0.1199,
         lines_of_airfoil,
-        {"uniform": "10000,40000", "graded": "1000,2000,4000,8000,16000", "adapted": "1000,2000,4000"},
+        {"uniform": "10000,40000", "graded": "1000,2000,4000,8000,16000", "wake": "", "adapted": "1000,2000,4000"},
         ((-0.3, -0.4), (1.7, 0.4)),
+        math.inf,
     ),
     "sphere": Flow(
         around_sphere,
@@ -150,12 +161,18 @@ FLOWS = {
         lines_of_sphere,
         {"uniform": "20000", "graded": "8000,20000", "adapted": "8000,20000"},
         ((-1.5, -1.5), (3.5, 1.5)),
+        3.0,
     ),
 }
 
 
-def graded(flow: Flow, domain: Domain, n: int) -> sizing.Field:
-    """Return sizes that grow from the body, for about `n` cells."""
+def graded(flow: Flow, domain: Domain, n: int, wake: bool = False) -> sizing.Field:
+    """Return sizes that grow from the body, or in the plane from its wake, too, for about `n` cells."""
+    if wake:
+        x = float(domain.upper[0])
+        # A strip of the length x with cells of the size h in its middle has 2 x / (slope h) of them.
+        strip = f"{4 * x / (flow.slope * n)} + {flow.slope} * hypot(y, fmax(1.0 - x, 0.0))"
+        return sizing.minimum(graded(flow, domain, n // 2), sizing.Expression(strip))
     d = domain.cell_dim
     distance = np.geomspace(1e-5, float(domain.measure) ** (1 / d) / 2, 2000)
     # Shells around a plate of length 1, or a ball of diameter 1.
@@ -235,7 +252,15 @@ def write_case(case: Case, flow: Flow, wedge: bool = False) -> None:
 
 
 def solve(
-    case: Case, flow: Flow, adapter: clvoro.Adapter, kind: str, n: int, first: int, cycles: int, seed: int
+    case: Case,
+    flow: Flow,
+    adapter: clvoro.Adapter,
+    kind: str,
+    n: int,
+    first: int | None = None,
+    cycles: int = 1,
+    seed: int = FIRST_SEED,
+    goal: foam.FieldSizes | None = None,
 ) -> float:
     """Solve on a mesh of `n` cells, or adapt one to the solution; return the coefficient of drag."""
     if kind == "structured":
@@ -244,20 +269,58 @@ def solve(
         case.run("simpleFoam")
         return float(case.table("forces", "coefficient.dat")["Cd"][-1])
     domain = flow.domain()
-    count = first if kind == "adapted" else n
-    size = graded(flow, domain, n) if kind == "graded" else (float(domain.measure) / count) ** (1 / domain.cell_dim)
+    count = first or n if kind == "adapted" else n
+    size: object = (float(domain.measure) / count) ** (1 / domain.cell_dim)
+    if kind in ("graded", "wake"):
+        size = graded(flow, domain, n, kind == "wake")
     made = adapter.run(domain, size, n_cells=count, seed=seed)
     folder = case.folder / "constant" / "polyMesh"
     made.to_openfoam(folder, types=dict.fromkeys(("inlet", "outlet", "sides"), "patch"), thickness=flow.thickness)
     made.save(folder / "clvoro.npz")
     write_case(case, flow)
     if kind == "adapted":
-        goal = foam.FieldSizes(forces="body")
         options: dict[str, Any] = {"sizes": goal, "interval": STEPS, "pictures": False, "adapter": adapter}
         foam.adapt_case(case.folder, n_cells=n, cycles=cycles, solver="simpleFoam", **options)
     else:
         case.run("simpleFoam")
     return float(case.table("forces", "coefficient.dat")["Cd"][-1])
+
+
+class Reference:
+    """The velocity on a fine mesh, against which others are measured.
+
+    Attributes
+    ----------
+    at : (n, d) ndarray
+        Centroids of its cells; around the sphere each is turned about the axis by several angles.
+    weight : (n,) ndarray
+        Their volumes.
+    velocity : (n, d) ndarray
+    """
+
+    def __init__(self, case: Case, flow: Flow) -> None:
+        mesh = case.latest_mesh()
+        inside = mesh.centroids[:, 1] < flow.reach
+        self.at, self.weight = mesh.centroids[inside, :2], mesh.volumes[inside]
+        self.velocity = case.field("U", len(mesh))[inside, :2]
+        if flow.thickness is None:
+            angle = 2.4 * np.add.outer(np.arange(4), 4 * np.arange(len(self.at))).ravel()
+            turn = np.column_stack([np.ones(len(angle)), np.cos(angle), np.sin(angle)])
+            self.at, self.velocity = (np.tile(v, (4, 1))[:, [0, 1, 1]] * turn for v in (self.at, self.velocity))
+            self.weight = np.tile(self.weight, 4)
+
+    def error(self, case: Case) -> float:
+        """Return the L2 error of the velocity of a case, in percent of what the body changes of the stream."""
+        d, mesh = self.at.shape[1], case.latest_mesh()
+        at = np.concatenate([mesh.centroids, mesh.faces[0][mesh.patch("body")]])[:, :d]
+        known = np.zeros((len(at), d))
+        known[: len(mesh)] = case.field("U", len(mesh))[:, :d]
+        found = LinearNDInterpolator(at, known)(self.at)
+        beyond = np.isnan(found[:, 0])
+        found[beyond] = NearestNDInterpolator(at, known)(self.at[beyond])
+        stream = np.eye(d)[0]
+        off, all_ = (self.weight @ ((v - self.velocity) ** 2).sum(axis=1) for v in (found, stream))
+        return 100 * math.sqrt(off / all_)
 
 
 def extrapolated(cells: list[float], drags: list[float]) -> tuple[float, float, float]:
@@ -280,12 +343,13 @@ def draw(records: list[dict[str, Any]], case: Case, flow: Flow, path: Path) -> N
     mpl.use("Agg")
     from matplotlib import pyplot as plt
 
+    shown = "velocity" if "velocity" in records[-1] else "error"
     figure, (left, right) = plt.subplots(1, 2, figsize=(12, 4.5), width_ratios=(2, 3), layout="constrained")
     for kind in flow.cells:
         rows = [row for row in records if row["mesh"] == kind]
-        errors = [abs(statistics.median(row["error"])) for row in rows]
+        errors = [abs(statistics.median(row[shown])) for row in rows]
         left.loglog([statistics.median(row["cells"]) for row in rows], errors, "o-", label=kind)
-    left.set(xlabel="cells", ylabel="error of the drag, %")
+    left.set(xlabel="cells", ylabel=f"error of the {'drag' if shown == 'error' else 'velocity'}, %")
     left.legend(frameon=False)
     known = FoamCase(case.folder)
     mesh = clvoro.load(known.mesh_folder(known.latest()) / "clvoro.npz")
@@ -301,6 +365,7 @@ COLUMNS = {
     "cells": lambda r: f"{statistics.median(r['cells']):,.0f}",
     "c_D": lambda r: spread(r["drag"], ".4f"),
     "error %": lambda r: spread(r["error"], "+.2f"),
+    "u %": lambda r: spread(r["velocity"], ".2f") if "velocity" in r else "",
     "s": lambda r: f"{statistics.median(r['seconds']):.0f}",
 }
 
@@ -309,10 +374,12 @@ def main() -> None:
     """Run the bench."""
     options_of = parser(__doc__)
     options_of.add_argument("--flow", choices=tuple(FLOWS), default="airfoil")
-    for kind in ("uniform", "graded", "adapted"):
+    for kind in ("uniform", "graded", "wake", "adapted"):
         options_of.add_argument(f"--{kind}", type=counts, metavar="LIST")
     options_of.add_argument("--first", type=int, metavar="N", help="cells of the first mesh; by default as many")
     options_of.add_argument("--reference", type=counts, metavar="LIST", help="cells of three or more structured meshes")
+    options_of.add_argument("--velocity", type=int, metavar="N", help="cells of the reference of the velocity")
+    options_of.add_argument("--goal", choices=tuple(GOALS), default="forces")
     options_of.add_argument("--cycles", type=int, default=4)
     options_of.add_argument("--samples", type=int, default=1)
     options_of.add_argument("--pictures", type=Path, metavar="FOLDER")
@@ -322,19 +389,28 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         asked = {kind: getattr(options, kind) for kind in flow.cells}
         lists = {kind: counts(flow.cells[kind]) if given is None else given for kind, given in asked.items()}
+        finest = None
+        if options.velocity:
+            case = Case(Path(folder) / "finest")
+            case.folder.mkdir()
+            solve(case, flow, adapter, "wake" if flow.thickness else "structured", options.velocity)
+            finest = Reference(case, flow)
         for kind, many_cells in {"structured": options.reference or [], **lists}.items():
             for n in many_cells:
-                found: dict[str, Any] = {"cells": [], "drag": [], "error": [], "seconds": []}
+                found: dict[str, list[float]] = {}
                 for sample in range(1 if kind == "structured" else options.samples):
                     case, start = Case(Path(folder) / f"{kind}-{n}-{sample}"), time.perf_counter()
                     case.folder.mkdir()
-                    many = round(n * (1 + 0.01 * sample))
+                    many, seed = round(n * (1 + 0.01 * sample)), FIRST_SEED + sample
                     drag = solve(
-                        case, flow, adapter, kind, many, options.first or many, options.cycles, FIRST_SEED + sample
+                        case, flow, adapter, kind, many, options.first, options.cycles, seed, GOALS[options.goal]
                     )
-                    row = (len(case.latest_mesh()), drag, 100 * (drag / flow.drag - 1), time.perf_counter() - start)
-                    for values, value in zip(found.values(), row, strict=True):
-                        values.append(value)
+                    row = {"cells": len(case.latest_mesh()), "drag": drag, "error": 100 * (drag / flow.drag - 1)}
+                    row["seconds"] = time.perf_counter() - start
+                    if finest is not None and (kind != "structured" or flow.thickness is not None):
+                        row["velocity"] = finest.error(case)
+                    for key, value in row.items():
+                        found.setdefault(key, []).append(value)
                 report.add({"mesh": kind, **found}, f"{kind}, {n}")
         if options.pictures is not None:
             options.pictures.mkdir(parents=True, exist_ok=True)
