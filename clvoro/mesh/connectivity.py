@@ -23,6 +23,13 @@ def distinct(values: np.ndarray) -> np.ndarray:
     return values[new]
 
 
+def used_indices(indices: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the numbers below `count` that occur among `indices`, sorted, and the place of each index among them."""
+    used = np.zeros(count, bool)
+    used[indices] = True
+    return np.flatnonzero(used), np.take(np.cumsum(used, dtype=np.int32) - 1, indices)
+
+
 def inverse(starts: np.ndarray, items: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
     """Return for each of `size` items the rows of the ragged array `starts` and `items` that have it, also ragged."""
     import scipy.sparse
@@ -59,6 +66,18 @@ def take_ranges(
             places = np.where(turned, np.repeat(2 * base + many, many) - places, places)
         found[first:end] = items.take(places, axis=0)
     return taken, found
+
+
+def rows_with(starts: np.ndarray, chosen: np.ndarray) -> np.ndarray:
+    """Return which rows of ragged items have one that is `chosen` (k,) bool: `reduceat` in a fraction of its time."""
+    found = np.empty(len(starts) - 1, bool)
+    for part in slices(len(found)):
+        here = starts[part.start : part.stop + 1]
+        count = np.zeros(here[-1] - here[0] + 1, np.int32)
+        np.cumsum(chosen[here[0] : here[-1]], out=count[1:])
+        count = count[here - here[0]]
+        found[part] = count[1:] > count[:-1]
+    return found
 
 
 def slices(count: int, size: int = 1 << 14) -> Iterator[slice]:

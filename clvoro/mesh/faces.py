@@ -318,7 +318,7 @@ class Faces(Sealed):
             neighbor=neighbor.astype(np.int32),
             layer=None if self.layer is None else self.layer[cells],
         )
-        return taken.compact(), np.unique(corners)
+        return taken.compact(), np.flatnonzero(np.bincount(corners))
 
     def compact(self) -> Faces:
         """Return the mesh without points that no face has."""

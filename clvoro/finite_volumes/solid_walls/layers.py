@@ -13,7 +13,7 @@ import scipy
 from ...arguments import format_point, warn
 from ...errors import MismatchWarning
 from ...geometry.boundary_layers import Layers
-from ...mesh.connectivity import distinct, following, take_rows
+from ...mesh.connectivity import distinct, following, rows_with, take_rows
 from ...mesh.diagram import Diagram
 from ...mesh.faces import Faces
 from ...mesh.results import thickness_in_words
@@ -558,7 +558,7 @@ class _LayeredWalls:
         """Cells with vertices that may move, and these with their neighbors, (n,) bool each."""
         f, moving = self.faces, np.zeros(len(self.faces.points), bool)
         moving[self._followers[0]] = moving[self.vertices[self.column]] = True
-        face = np.logical_or.reduceat(moving[f.corners], f.starts[:-1])
+        face = rows_with(f.starts, moving[f.corners])
         near = np.zeros(f.n_cells, bool)
         k = f.n_inner
         near[f.owner[face]] = near[f.neighbor[:k][face[:k]]] = True

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ...mesh.connectivity import take_rows
+from ...mesh.connectivity import rows_with, take_rows
 from ...mesh.faces import Faces
 from ..defects import DefectLimits
 from ..gate import rejected_cells
@@ -68,8 +68,11 @@ def changed_cells(before: Faces, made: Faces) -> np.ndarray:
     changed = np.diff(made.starts) != np.diff(before.starts)[rows]
     kept = np.flatnonzero(~changed)
     starts, corners = take_rows(made.starts, made.corners, kept)
-    same = made.points[corners] == before.points[take_rows(before.starts, before.corners, rows[kept])[1]]
-    changed[kept] = ~np.logical_and.reduceat(same.all(axis=1), starts[:-1])
+    there = take_rows(before.starts, before.corners, rows[kept])[1]
+    moved = np.zeros(len(corners), bool)
+    for x, y in zip(np.ascontiguousarray(made.points.T), np.ascontiguousarray(before.points.T), strict=True):
+        moved |= x.take(corners) != y.take(there)
+    changed[kept] = rows_with(starts, moved)
     return cells_of(made, changed)
 
 
@@ -77,7 +80,7 @@ def touching_walls(faces: Faces) -> np.ndarray:
     """Return which cells have a vertex on a wall, (n,) bool."""
     on = np.zeros(len(faces.points), bool)
     on[faces.corners[faces.starts[faces.n_inner] :]] = True
-    return cells_of(faces, np.logical_or.reduceat(on[faces.corners], faces.starts[:-1]))
+    return cells_of(faces, rows_with(faces.starts, on[faces.corners]))
 
 
 def cells_of(faces: Faces, chosen: np.ndarray) -> np.ndarray:

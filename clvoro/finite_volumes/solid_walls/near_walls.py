@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ...mesh.connectivity import take_rows
+from ...mesh.connectivity import rows_with, take_rows, used_indices
 from ...mesh.faces import Faces
 from .wall_surface import WallSurface
 
@@ -96,7 +96,7 @@ class NearWalls:
         for _ in range(_RINGS):
             touched = np.zeros(len(faces.points), bool)
             touched[take_rows(faces.starts, faces.corners, _faces_of(faces, near))[1]] = True
-            beside = np.logical_or.reduceat(touched[faces.corners], faces.starts[:-1])
+            beside = rows_with(faces.starts, touched[faces.corners])
             near[faces.owner[beside]] = near[faces.neighbor[beside & (faces.neighbor >= 0)]] = True
             near[n:] = False
         rows = np.flatnonzero(near)
@@ -109,8 +109,9 @@ class NearWalls:
         turned = owner == p
         owner[turned], neighbor[turned] = neighbor[turned], p
         starts, corners = take_rows(faces.starts, faces.corners, taken, turned)
-        vertices, corners = np.unique(corners, return_inverse=True)
-        cells = CellFaces(owner, neighbor, starts, corners, faces.points[vertices].astype(float), taken)
+        vertices, corners = used_indices(corners, len(faces.points))
+        points_there = faces.points[vertices].astype(float)
+        cells = CellFaces(owner, neighbor, starts, corners.astype(np.int64), points_there, taken)
         away = np.asarray(surface.solid.upper) + 1e6 * surface.solid.extent
         return cls(
             faces,
@@ -212,8 +213,10 @@ def _may_reach(surface: WallSurface, points: np.ndarray, sizes: np.ndarray, face
     # Both generators of a face are equally far from its vertices.
     starts, corners = take_rows(faces.starts, faces.corners, rows)
     owner, neighbor = faces.owner[rows], faces.neighbor[rows]
-    away = faces.points[corners] - np.repeat(points[owner], np.diff(starts), axis=0)
-    farthest = np.maximum.reduceat(np.einsum("vd,vd->v", away, away), starts[:-1]) if len(rows) else np.zeros(0)
+    square = np.zeros(len(corners))
+    for x, y in zip(np.ascontiguousarray(faces.points.T), points.T, strict=True):
+        square += (x.take(corners) - np.repeat(y[owner], np.diff(starts))) ** 2
+    farthest = np.maximum.reduceat(square, starts[:-1]) if len(rows) else square
     reach = np.full(n, -1.0)
     for cells in (owner, neighbor):
         np.maximum.at(reach, cells, farthest)

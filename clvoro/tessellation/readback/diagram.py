@@ -12,6 +12,7 @@ import scipy
 
 from ...finite_volumes.borders import on_surfaces
 from ...geometry.domain import ClipBox, Domain
+from ...mesh.connectivity import used_indices
 from ...mesh.diagram import Diagram
 from ...opencl.engine import Engine
 from ...opencl.primitives import Gather, Lists
@@ -90,13 +91,6 @@ def starts_of(counts: np.ndarray) -> np.ndarray:
     found = np.zeros(len(counts) + 1, np.int32)
     np.cumsum(counts, out=found[1:])
     return found
-
-
-def used_indices(indices: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the numbers below `count` that occur among `indices`, sorted, and the place of each index among them."""
-    used = np.zeros(count, bool)
-    used[indices] = True
-    return np.flatnonzero(used), np.take(np.cumsum(used, dtype=np.int32) - 1, indices)
 
 
 def kept_faces(t: Tessellation, m: int, copy: bool) -> Tessellation:
