@@ -34,7 +34,7 @@ from .mesh.results import Result, Transported
 from .opencl import devices as device
 from .opencl.build_notice import BuildNotice, report_builds
 from .opencl.engine import Engine
-from .opencl.peers import ALONE, Peers, Ranks
+from .opencl.peers import ALONE, Peers, peers_of
 from .opencl.prebuild import renew
 from .opencl.probe import check_process
 from .tessellation.readback.diagram import make_diagram
@@ -59,7 +59,10 @@ class Adapter:
     comm : mpi4py.MPI.Comm, optional
         Share runs among the ranks of this communicator: all of them create an adapter and call `run` with the same
         arguments. Each gets a `Result` of its own cells, and ``result.gather()`` returns the whole mesh on rank 0. For
-        boxes with walls, not for "transport", moving meshes, layers, fixed generators and checkpoints.
+        boxes with walls, not for "transport", moving meshes, layers, fixed generators and checkpoints. Without `ctx`
+        the ranks of a node take its GPUs in turn.
+    share_gpus : bool
+        Whether several ranks may have one GPU, which is refused otherwise.
 
     Attributes
     ----------
@@ -94,6 +97,7 @@ class Adapter:
         ctx: cl.Context | None = None,
         dtype: Literal["float64", "float32"] | DTypeLike = "float64",
         comm: object = None,
+        share_gpus: bool = False,
     ) -> None:
         try:
             real = np.dtype(dtype)  # type: ignore[arg-type]
@@ -107,12 +111,13 @@ class Adapter:
                 "clvoro.create_context(device), with a device or a part of its name"
             )
         check_process()
-        self.ctx = device.create_context(fp64=real == np.float64) if ctx is None else ctx
+        self._peers = peers_of(comm)
+        place = device.place_on_node(self._peers)
+        self.ctx = self._peers.agree(lambda: device.context_of(ctx, real, place))
         self.dtype = real
-        if real == np.float64:
-            device.require_fp64(self.ctx)
+        if not share_gpus:
+            device.refuse_shared_gpus(self._peers, self.ctx.devices[0])
         self.queue = cl.CommandQueue(self.ctx)
-        self._peers = ALONE if comm is None else comm if isinstance(comm, Peers) else Ranks(comm)
         self._stages: dict[tuple[int, tuple[str, ...], bool], Stages] = {}
         self._busy = threading.Lock()
         self._owner: int | None = None

@@ -1019,6 +1019,7 @@ TESTED_IN = {
     "frames, expected one, since ranks": "adaptation/test_ranks.py::test_what_the_command_refuses_over_ranks",
     "call clvoro without mpiexec": "adaptation/test_ranks.py::test_what_the_command_refuses_over_ranks",
     "mpi4py belongs to another MPI": "adaptation/test_ranks.py::test_what_the_command_refuses_over_ranks",
+    "have one GPU, ": "opencl/test_devices.py::test_ranks_of_a_node_take_its_gpus_in_turn",
     "surfaces are in space": "adaptation/test_surfaces.py::test_what_is_refused_at_the_door",
     "cross or cover each other": "adaptation/test_surfaces.py::test_what_is_refused_at_the_door",
     "surfaces are outside of ": "adaptation/test_surfaces.py::test_what_is_refused_at_the_door",

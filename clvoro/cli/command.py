@@ -97,6 +97,7 @@ def _add_run(commands: Any) -> None:
 
 def _add_settings(run: Any) -> None:
     run.add_argument("--device", metavar="NAME", help="gpu, cpu, part of a name, or PLATFORM:DEVICE indices")
+    run.add_argument("--share-gpus", action="store_true", help="under mpiexec: let several ranks have one GPU")
     run.add_argument(
         "--method",
         metavar="M",
@@ -463,6 +464,7 @@ def _run(arguments: argparse.Namespace) -> int:
         solver=arguments.check_solver,
         peers=arguments.peers,
         pieces=arguments.pieces,
+        share_gpus=arguments.share_gpus,
     )
     if job.run():
         return INTERRUPTED

@@ -89,6 +89,8 @@ class Job:
         The ranks of `mpiexec` that share the run: all of them have the same job. Rank 0 gathers the mesh and writes.
     pieces : bool
         Each rank writes its own cells instead.
+    share_gpus : bool
+        Whether ranks may have one GPU.
     """
 
     case: Case
@@ -110,6 +112,7 @@ class Job:
     command: tuple[str, ...] = ()
     peers: Peers = ALONE
     pieces: bool = False
+    share_gpus: bool = False
     interrupted: bool = field(default=False, init=False)
     rejected: bool = field(default=False, init=False)
     missed: bool = field(default=False, init=False)
@@ -189,7 +192,8 @@ class Job:
         from .. import Adapter, create_context
 
         dtype = self.case.run.get("dtype", "float64")
-        return Adapter(create_context(self.device, fp64=dtype == "float64"), dtype=dtype, comm=self.peers)
+        context = create_context(self.device, fp64=dtype == "float64", comm=self.peers)
+        return Adapter(context, dtype, self.peers, self.share_gpus)
 
     def _refuse_pieces(self) -> None:
         """Raise an error before the run if ranks cannot share it, or cannot write its files in pieces."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import re
+import socket
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -16,9 +17,10 @@ import numpy as np
 import pyopencl as cl
 from numpy.typing import DTypeLike
 
-from ..errors import DeviceError, InputTypeError
+from ..errors import DeviceError, InputError, InputTypeError
 from . import probe as _probe
 from . import runtimes as _runtimes
+from .peers import Peers, peers_of
 from .prebuild import start_workers
 from .probe import has_fp64, one_line
 
@@ -94,7 +96,7 @@ class _Candidate:
         return (3, 0)
 
 
-def create_context(device: str | cl.Device | None = None, *, fp64: bool = False) -> cl.Context:
+def create_context(device: str | cl.Device | None = None, *, fp64: bool = False, comm: object = None) -> cl.Context:
     """Return a context on the best working device.
 
     The order is: `device`, the environment variable `PYOPENCL_CTX`, a GPU, PoCL, any other CPU.
@@ -105,9 +107,12 @@ def create_context(device: str | cl.Device | None = None, *, fp64: bool = False)
     device : str or pyopencl.Device, optional
         Part of a platform's name in any case (``"nvidia"``, ``"pocl"``) or, where no platform has it,
         of a device's or vendor's; a kind (``"gpu"``, ``"cpu"``), or indices ``"platform:device"``
-        as `list_devices` gives them.
+        as `list_devices` gives them; or the PCI address of a GPU, such as ``"0000:3b:00.0"``.
     fp64 : bool
         Take only devices that compute in float64.
+    comm : mpi4py.MPI.Comm, optional
+        All ranks of this communicator call this together. Of several GPUs of a node, equally good, each of its ranks
+        takes another one, in the order of ranks.
 
     Returns
     -------
@@ -121,6 +126,20 @@ def create_context(device: str | cl.Device | None = None, *, fp64: bool = False)
     InputTypeError
         If `device` is of another type.
     """
+    peers = peers_of(comm)
+    place = place_on_node(peers)
+    return peers.agree(lambda: context_for(device, fp64, place))
+
+
+def context_of(ctx: cl.Context | None, real: np.dtype, place: int) -> cl.Context:
+    """Return `ctx`, or a context of `context_for`, whose device computes in `real`."""
+    found = context_for(None, real == np.float64, place) if ctx is None else ctx
+    require_fp64(found, real)
+    return found
+
+
+def context_for(device: str | cl.Device | None, fp64: bool, place: int) -> cl.Context:
+    """Return a context as `create_context` does, for the rank at this `place` among those of its node."""
     _probe.check_process()
     if isinstance(device, cl.Device):
         return _checked_context(_describe(device, "given"), fp64)
@@ -142,13 +161,70 @@ def create_context(device: str | cl.Device | None = None, *, fp64: bool = False)
         wanted = _matching(found, device.strip())
         subject = f"device={device!r}: no working OpenCL device of that name or index"
     failures = []
-    for candidate in sorted(wanted, key=lambda c: c.rank):
+    for candidate in _from_place(sorted(wanted, key=lambda c: c.rank), place):
         ctx, reason = _try_device(candidate.device, fp64)
         if ctx is not None:
             return ctx
         failures.append(f"{candidate.index} {candidate.title}: {reason}")
     chosen = index is not None or "PYOPENCL_CTX" in os.environ
     raise DeviceError(_complaint(subject, found, failures, broken, chosen, fp64))
+
+
+def _from_place(candidates: list[_Candidate], place: int) -> list[_Candidate]:
+    """Return `candidates`, best first, so that the one at `place` among the equally good best ones comes first."""
+    best = sum(c.rank == candidates[0].rank for c in candidates)
+    first = place % max(best, 1)
+    return [*candidates[first:best], *candidates[:first], *candidates[best:]]
+
+
+def place_on_node(peers: Peers) -> int:
+    """Return how many parts before this one are on the same machine. All parts call this together."""
+    return _nodes(peers)[: peers.number].count(socket.gethostname())
+
+
+def _nodes(peers: Peers) -> list[str]:
+    name = np.zeros(256, np.uint8)
+    own = socket.gethostname().encode()[:256]
+    name[: len(own)] = np.frombuffer(own, np.uint8)
+    return [found.tobytes().rstrip(b"\0").decode() for found in peers.gather(name)]
+
+
+def pci_address(device: cl.Device) -> str:
+    """Return the PCI address of a GPU, as ``"0000:3b:00.0"``; "" if its driver does not give one."""
+    try:
+        domain = getattr(device, "pci_domain_id_nv", 0)
+        return f"{domain:04x}:{device.pci_bus_id_nv:02x}:{device.pci_slot_id_nv >> 3:02x}.{device.pci_slot_id_nv & 7}"
+    except (cl.Error, AttributeError):
+        pass
+    try:
+        topology = device.topology_amd
+        return f"0000:{topology.bus:02x}:{topology.device:02x}.{topology.function}"
+    except (cl.Error, AttributeError):
+        return ""
+
+
+def refuse_shared_gpus(peers: Peers, device: cl.Device) -> None:
+    """Raise if two parts have one GPU. All parts call this together.
+
+    Raises
+    ------
+    InputError
+        On all parts. GPUs whose driver gives no PCI address count as different.
+    """
+    address = pci_address(device) if device.type & cl.device_type.GPU else ""
+    code = np.zeros(16, np.uint8)
+    code[: len(address)] = np.frombuffer(address.encode(), np.uint8)
+    places = [
+        f"{found.tobytes().rstrip(bytes(1)).decode()} of {node}" if found.any() else ""
+        for found, node in zip(peers.gather(code), _nodes(peers), strict=True)
+    ]
+    for number, place in enumerate(places):
+        if place and (first := places.index(place)) < number:
+            raise InputError(
+                f"ranks {first} and {number} of {peers.count} have one GPU, {place}, expected one for each; start at "
+                "most as many ranks on a node as it has GPUs, choose a device for each rank, or let them share it: "
+                "Adapter(..., share_gpus=True), clvoro run --share-gpus"
+            )
 
 
 @cache
@@ -314,6 +390,7 @@ def _matching(found: Iterable[_Candidate], query: str) -> list[_Candidate]:
     aliases = {"Portable Computing Language": "pocl"}
     # Platforms first: PoCL names its device after the processor, such as "Intel".
     for parts in (
+        lambda c: pci_address(c.device).lower(),
         lambda c: f"{c.platform} / {aliases.get(c.platform, '')}",
         lambda c: f"{c.device.vendor} / {c.platform} / {c.name}",
     ):

@@ -259,5 +259,18 @@ class Ranks(Peers):
         return int(self._alarms.recv(source=part, tag=tag))
 
 
+def peers_of(comm: object) -> Peers:
+    """Return the parts that `comm` stands for: a communicator of mpi4py, or `Peers`; None stands for a part alone.
+
+    All ranks call this together.
+
+    Raises
+    ------
+    InputTypeError
+        If `comm` is something else.
+    """
+    return ALONE if comm is None else comm if isinstance(comm, Peers) else Ranks(comm)
+
+
 def _bytes(values: np.ndarray) -> np.ndarray:
     return values.reshape(-1).view(np.uint8)

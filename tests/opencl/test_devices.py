@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+import threading
 from importlib import metadata
 from pathlib import Path
 
@@ -10,11 +11,12 @@ import numpy as np
 import pyopencl as cl
 import pytest
 
-from clvoro.errors import DeviceError, InputTypeError
+from clvoro.errors import DeviceError, InputError, InputTypeError, RankError
 from clvoro.opencl import devices as device
 from clvoro.opencl import probe as _probe
 from clvoro.opencl import program
 from clvoro.opencl import runtimes as _runtimes
+from tests.reference.peers import run_parts
 
 ROOT = Path(__file__).parents[2]
 
@@ -69,6 +71,34 @@ def test_order_of_choice(machine, devices, broken, expected):
     assert device.create_context() == [expected]
     chosen = [d for d in device.list_devices() if d.default]
     assert [d.name for d in chosen] == [expected.name]
+
+
+def test_ranks_of_a_node_take_its_gpus_in_turn(machine, monkeypatch):
+    """Two nodes of two GPUs: four ranks have one each; a fifth shares one, which is refused. CPUs may be shared."""
+    gpus = [FakeDevice(-10 - k, "Maker", f"GPU {k}", GPU) for k in range(2)]
+    for k, gpu in enumerate(gpus):
+        gpu.pci_domain_id_nv, gpu.pci_bus_id_nv, gpu.pci_slot_id_nv = 0, 0x3B + k, 0
+    machine(*gpus, SMALL_GPU, POCL)
+    assert [device.context_for(None, False, place)[0].name[-1] for place in range(4)] == ["0", "1", "0", "1"]
+    assert device.context_for("0000:3c:00.0", False, 0) == [gpus[1]]
+    nodes = threading.local()
+    monkeypatch.setattr(device.socket, "gethostname", lambda: getattr(nodes, "name", "node0"))
+
+    def choose(peers, ranks_per_node, make):
+        nodes.name = f"node{peers.number // ranks_per_node}"
+        made = make(peers)
+        device.refuse_shared_gpus(peers, made[0])
+        return made[0].name
+
+    def create(peers):
+        return device.create_context(comm=peers)
+
+    assert run_parts(4, lambda peers: choose(peers, 2, create)) == ["GPU 0", "GPU 1"] * 2
+    with pytest.raises(InputError, match=r"ranks 0 and 2 of 3 have one GPU, 0000:3b:00.0 of node0.*share_gpus"):
+        run_parts(3, lambda peers: choose(peers, 3, create))
+    assert run_parts(2, lambda peers: choose(peers, 2, lambda _: [POCL])) == [POCL.name] * 2
+    with pytest.raises((DeviceError, RankError)):
+        run_parts(2, lambda peers: device.create_context("none" if peers.number else None, comm=peers))
 
 
 ON_INTEL = FakeDevice(-6, "Portable Computing Language", "cpu-Intel(R) Xeon(R)", CPU, vendor="GenuineIntel")
