@@ -430,11 +430,15 @@ class Domain(ClipBox):
         super().__init_subclass__()
         Domain.kinds[cls.__name__] = cls
 
-    # Equal domains have equal descriptions; names may differ.
+    # Equal domains are the same region, with the same borders inside. Names may differ.
 
     @cached_property
     def _identity(self) -> dict[str, Any]:
         return {key: value for key, value in self.describe().items() if key != "names"}
+
+    def same_region(self, other: Domain) -> bool:
+        """Return whether the boundary of another domain is the same; names and borders inside may differ."""
+        return self is other or (type(other) is type(self) and self._identity == other._identity)
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({', '.join(f'{key}={value}' for key, value in self.describe().items())})"
@@ -442,7 +446,7 @@ class Domain(ClipBox):
     def __eq__(self, other: object) -> bool:
         if type(other) is not type(self):
             return NotImplemented
-        return self is other or self._identity == other._identity
+        return self.same_region(other) and self.described_borders == other.described_borders
 
     def __hash__(self) -> int:
         return hash((type(self), self.lower, self.upper))

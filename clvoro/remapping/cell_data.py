@@ -63,7 +63,7 @@ def transfer_values(
     filled = columns if columns.shape[1] else np.zeros((len(source), 1))
     # Scale to numbers around 1 by powers of two: this is exact, and no product overflows.
     scale = np.exp2(np.floor(np.log2(np.maximum(np.abs(filled).max(axis=0), 1e-300))))
-    same = source.domain == target.domain
+    same = source.domain.same_region(target.domain)
     with adapter._alone() if adapter is not None else nullcontext():
         ctx = shared_context() if adapter is None else adapter.ctx
         means, low, high, covered = _intersected(ctx, source, target, filled / scale, order, bool(limited))

@@ -178,7 +178,7 @@ class OnCells(Field):
 
     def warnings(self, domain: Domain) -> list[str]:
         """Return a warning if the mesh covers little of `domain`."""
-        if domain == self.mesh.domain:
+        if domain.same_region(self.mesh.domain):
             return []
         remedy = "give values on a mesh of the whole domain"
         return coverage_warnings(repr(self), domain, self.mesh.domain.lower, self.mesh.domain.upper, remedy)

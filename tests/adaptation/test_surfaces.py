@@ -16,15 +16,25 @@ def rectangle(low, high, z=0.5, rise=0.0):
     return np.array(corners), np.array([(0, 1, 2), (0, 2, 3)])
 
 
+def fault(slope):
+    """Two halves of a plane that is 0.5 + slope * (z - 0.5) in x, which meet where another one crosses."""
+    x = [0.5 + slope * (z - 0.5) for z in (-0.1, 0.5, 1.1)]
+    points = [(a, y, z) for a, z in zip(x, (-0.1, 0.5, 1.1), strict=True) for y in (-0.1, 1.1)]
+    return np.array(points), np.array([(0, 1, 3), (0, 3, 2), (2, 3, 5), (2, 5, 4)])
+
+
+FAULTED = 0.425, 0.425, 0.075, 0.075  # the volumes between them
+
 CASES = {
     "cube": (BOX, {"heater": CUBE}, "float64", {"heater": CUBE.measure}, 1e-9),
     "touching": (
         BOX,
-        {"left": Solid.box((0.2, 0.3, 0.3), (0.5, 0.7, 0.7)), "right": Solid.box((0.5, 0.3, 0.3), (0.8, 0.7, 0.7))},
+        {"left": Solid.box((0.25, 0.3, 0.3), (0.5, 0.7, 0.7)), "right": Solid.box((0.5, 0.3, 0.3), (0.75, 0.7, 0.7))},
         "float64",
-        {"left": 0.048, "right": 0.048},
+        {"left": 0.04, "right": 0.04},
         1e-9,
     ),
+    "crossing": (BOX, [fault(0.3), fault(-0.3)], "float64", {f"region-{k}": v for k, v in enumerate(FAULTED)}, 1e-9),
     "oblique": (BOX, rectangle(-0.2, 1.2, rise=0.3), "float32", {"region-0": 0.5, "region-1": 0.5}, 1e-5),
     "at a wall": (BOX, {"slab": Solid.box((0, 0, 0), (0.3, 1, 1))}, "float64", {"slab": 0.3}, 1e-9),
     "ball": (BOX, {"ball": Solid.ball((0.5, 0.5, 0.5), 0.3)}, "float64", {"ball": 4 / 3 * np.pi * 0.027}, 0.06),
@@ -105,6 +115,14 @@ def test_generators_beside_surfaces_are_mirror_images_and_nearest_to_them(mesh):
     assert len(free) > 1000
     nearest = np.array([np.linalg.norm(free - p, axis=1).min() for p in x[::7]])
     assert (nearest > away[::7, 0]).all()
+
+
+def test_domains_with_other_surfaces_are_other_domains():
+    room, other = BOX.with_surfaces({"heater": CUBE}), BOX.with_surfaces({"oven": CUBE})
+    assert room == BOX.with_surfaces({"heater": CUBE})
+    assert len({room, BOX.with_surfaces({"heater": CUBE}), other, BOX}) == 3
+    assert room.same_region(BOX)
+    assert CUBE.with_surfaces(rectangle(0, 1)) != CUBE
 
 
 def test_segments_cross_surfaces_as_often_as_they_change_sides():

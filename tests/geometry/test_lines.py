@@ -80,12 +80,15 @@ def test_regions_count_from_the_largest_and_join_at_seams():
     assert ring.borders.region_of(ring, np.array([(0.5, 0.1), (0.5, 0.9), (0.5, 0.5)])).tolist() == [0, 0, 1]
 
 
-def test_lines_stay_in_copies_of_the_domain():
+def test_lines_stay_in_copies_of_the_domain_and_make_it_another_one():
     import copy
 
-    for domain in (BOX.with_lines(FAULT), PAIRS["island"][0].with_lines(FAULT)):
+    for bare in (BOX, PAIRS["island"][0]):
+        domain = bare.with_lines(FAULT)
         assert copy.copy(domain).borders.describe() == domain.borders.describe()
-        assert domain == type(domain).described(**domain.describe())
+        assert copy.copy(domain) == domain == bare.with_lines(FAULT)
+        assert domain not in (bare, bare.with_lines([FAULT, BED]))
+        assert domain.same_region(bare)
 
 
 @pytest.mark.parametrize("kind", list(PAIRS))

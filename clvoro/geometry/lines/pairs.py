@@ -489,11 +489,11 @@ def _wall_directions(domain: Domain, nodes: np.ndarray) -> dict[int, list[float]
     return found
 
 
-def choose_angles(chords: list[float], walls: list[float]) -> np.ndarray:
+def choose_angles(chords: list[float], walls: list[float], separation: float = _SEPARATION) -> np.ndarray:
     """Return for chords in the given directions around a node the angle between each and its generators, (k,).
 
     They are as close to 45 degrees as may be. Two neighboring chords share a generator, whose angles to both are equal
-    parts of those chords, or their generators are apart. Beside walls there is room for one.
+    parts of those chords, or their generators are apart by at least `separation`. Beside walls there is room for one.
     """
     k = len(chords)
     order = np.argsort(chords, kind="stable")
@@ -507,7 +507,7 @@ def choose_angles(chords: list[float], walls: list[float]) -> np.ndarray:
     for wall in walls:
         for i, chord in enumerate(chords):
             most[i] = min(most[i], _AT_WALL * _between(chord, wall))
-    for system in _systems(sectors, k):
+    for system in _systems(sectors, k, separation):
         rows, right = system
         # The nearest to 45 degrees: x = 45 + A^T (A A^T)^+ (b - A 45).
         start = np.minimum(np.full(k, math.radians(45)), most)
@@ -516,7 +516,7 @@ def choose_angles(chords: list[float], walls: list[float]) -> np.ndarray:
         for a, b, width in sectors:
             shared = any(row[a] and row[b] and abs(r - width) < 1e-12 for row, r in zip(rows, right, strict=True))
             if not shared:
-                misfit += max(0.0, x[a] + x[b] - max(width - _SEPARATION, 0) - 1e-9)
+                misfit += max(0.0, x[a] + x[b] - max(width - separation, 0) - 1e-9)
         misfit += np.maximum(_ANGLES[0] - x, 0).sum() + np.maximum(x - most - 1e-9, 0).sum()
         cost = float(((x - math.radians(45)) ** 2).sum()) + 1e3 * float(misfit)
         if cost < best:
@@ -524,7 +524,9 @@ def choose_angles(chords: list[float], walls: list[float]) -> np.ndarray:
     return np.clip(angles, *_ANGLES)
 
 
-def _systems(sectors: list[tuple[int, int, float]], k: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+def _systems(
+    sectors: list[tuple[int, int, float]], k: int, separation: float
+) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """Yield linear systems for the angles of `k` chords.
 
     In each sector is a shared generator, or two at the least angle between them, or two farther apart.
@@ -536,7 +538,7 @@ def _systems(sectors: list[tuple[int, int, float]], k: int) -> Iterator[tuple[np
         row[b] += 1
         options: list[tuple[np.ndarray, float] | None] = [None]
         if width < math.pi and a != b:
-            options = [(row, width), *([(row, width - _SEPARATION)] if width > _SEPARATION else []), None]
+            options = [(row, width), *([(row, width - separation)] if width > separation else []), None]
         choices.append(options)
     if len(sectors) > 6:
         choices = [options[:1] for options in choices]

@@ -140,9 +140,16 @@ class ChainOfChords:
     turns: list[np.ndarray]
     axes: np.ndarray
 
-    def __init__(self, number: int, line: Line, vertices: np.ndarray, size: Callable[[np.ndarray], np.ndarray]) -> None:
+    def __init__(
+        self,
+        number: int,
+        line: Line,
+        vertices: np.ndarray,
+        size: Callable[[np.ndarray], np.ndarray],
+        ends: tuple[float, float] = (1.0, 1.0),
+    ) -> None:
         self.number, self.line, self.vertices = number, line, vertices
-        at, self.middle, self.h = _divide(self.line, size)
+        at, self.middle, self.h = _divide(self.line, size, ends)
         self.nodes = self.line.along(self.line.points, at)
         chords = np.diff(self.nodes, axis=0)
         self.lengths = np.linalg.norm(chords, axis=1)
@@ -185,8 +192,13 @@ class _Crease(ChainOfChords):
         self.set_radii(self.h / np.sqrt(np.tan(half)) * (np.cos(half) + 1 / np.cos(half)) / 3)
 
 
-def _divide(line: Line, size: Callable[[np.ndarray], np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the lengths along a line at the ends of chords, (n + 1,), in their middle, and the sizes there, (n,)."""
+def _divide(
+    line: Line, size: Callable[[np.ndarray], np.ndarray], ends: tuple[float, float]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the lengths along a line at the ends of chords, (n + 1,), in their middle, and the sizes there, (n,).
+
+    The first and the last chord are longer than the others by the factors `ends`.
+    """
     total = float(line.at[-1])
     n = _FEWEST
     while True:
@@ -196,13 +208,21 @@ def _divide(line: Line, size: Callable[[np.ndarray], np.ndarray]) -> tuple[np.nd
         if n >= min(_SAMPLES * reached[-1], _MOST):
             break
         n = int(min(2 * _SAMPLES * reached[-1], _MOST))
-    count = round(float(reached[-1]))
+    count = round(float(reached[-1]) - sum(ends) + 2)
     if line.closed:
         count = max(count, 3)
-    marks = np.arange(2 * count + 1) / max(2 * count, 1) * reached[-1]
+    if ends == (1.0, 1.0):
+        marks = np.arange(2 * count + 1) / max(2 * count, 1) * reached[-1]
+        scale = reached[-1] / max(count, 1)
+    else:
+        count = max(count, 2)
+        lengths = np.ones(count)
+        lengths[0], lengths[-1] = ends
+        scale = reached[-1] / lengths.sum()
+        marks = np.append(0, np.cumsum(np.repeat(0.5 * scale * lengths, 2)))
     at = np.interp(marks, reached, s)
     # Cells are as long along the line as across it.
-    return at[::2], at[1::2], np.interp(at[1::2], s, h) * (reached[-1] / max(count, 1))
+    return at[::2], at[1::2], np.interp(at[1::2], s, h) * scale
 
 
 def share_corners(chains: Sequence[ChainOfChords]) -> None:

@@ -29,6 +29,10 @@ from .sheets import Sheets
 _ON_WALL = 1e-7  # of the domain: points so near to its walls lie on them
 _PARTS = 64  # parts of the domain's extent into which edges are divided to find where they leave it
 _REACH = math.sqrt(0.5)  # distance of generators around a chord, over h
+_APART = math.radians(45)  # least angle between two of them in one sector
+_HEIGHT, _LONGEST_REACH = 0.38, 1.3  # of h: their least distance from patches there, and their largest from the chord
+_FROM_WALL = 0.25  # of h: so far from a wall the angle at which an edge meets it is measured
+_DEPTH_AT_WALL, _LONGEST_AT_WALL = 0.4, 2.5  # least distance of generators there from the wall, longest chord, over h
 _JOINED = 0.3  # of a radius: so near to its balls is the joint generator of two chains before it is fitted
 _BESIDE = 0.64  # of h: generators this near to a patch, straight above it, are those of its cells
 _UPRIGHT = 0.98  # cosine of the least angle there
@@ -51,6 +55,8 @@ _CLEAR, _COARSE = 1.06, 0.03  # radius in which no other generators are, over th
 _ROOM = 0.4  # of h: least distance of generators that are no pair
 # Heights of generators shrink, step by step, until a wall is this share of them away.
 _AT_WALL, _SHRINKAGE, _SHRINKAGES = 0.7, 0.85, 8
+_OF_GAP, _LEAST_HEIGHT = 3.0, 0.28  # gaps between patches over heights, and the least height for them over h
+_OPPOSITE = 0.8  # patches beside each other are opposite to each other if the cosine to the normal is larger
 _DEPTH = 0.6  # of its height: least distance of a generator from walls
 _STRAIGHT = 0.55  # of the height of a generator: least distance from surfaces
 _ROUNDS = 40
@@ -89,10 +95,12 @@ class _Fold(ChainOfChords):
         vertices: np.ndarray,
         edges: np.ndarray,
         size: Callable[[np.ndarray], np.ndarray],
+        domain: Domain,
     ) -> None:
-        super().__init__(number, line, vertices, size)
+        first, last = (_length_at_wall(line, k, size, domain) if vertices[k] < 0 else 1.0 for k in (0, -1))
+        super().__init__(number, line, vertices, size, (first, last))
         row = np.clip(np.searchsorted(line.at, self.middle, side="right") - 1, 0, len(edges) - 1)
-        self.turns, axes = [], []
+        self.turns, axes, reach = [], [], []
         corners, triangles = sheets.surface.corners, sheets.surface.triangles
         for edge, way in zip(edges[row].tolist(), self.ways, strict=True):
             items = sheets.triangles_at[sheets.triangle_starts[edge] : sheets.triangle_starts[edge + 1]]
@@ -102,15 +110,32 @@ class _Fold(ChainOfChords):
             one = out[0] / np.linalg.norm(out[0])
             other = np.cross(way, one)
             axes.append((one, other))
-            self.turns.append(_angles_of_generators(np.arctan2(out @ other, out @ one)))
+            turns, far = _angles_of_generators(np.arctan2(out @ other, out @ one))
+            self.turns.append(turns)
+            reach.append(far)
         self.axes = np.array(axes).reshape(-1, 2, 3)
-        self.set_radii(_REACH * self.h)
+        self.set_radii(np.array(reach) * self.h)
 
 
-def _angles_of_generators(sheets: np.ndarray) -> np.ndarray:
-    """Return the angles of the generators around a chord at which patches end in the directions `sheets` (m,)."""
+def _length_at_wall(line: Line, end: int, size: Callable[[np.ndarray], np.ndarray], domain: Domain) -> float:
+    """Return how long the chord at an end of a line on a wall is, over h: long if the line is not upright there."""
+    h = float(np.asarray(size(line.points[[end]]))[0])
+    away = min(_FROM_WALL * h, 0.5 * line.at[-1])
+    x = line.along(line.points, np.array([away if end == 0 else line.at[-1] - away]))
+    upright = min(float(domain.boundary_distance(x)[0]) / away, 1.0)
+    sine = math.sqrt(1 - upright**2)
+    return min(max(1.0, 2 * (_DEPTH_AT_WALL + sine) / max(upright, 1e-3)), _LONGEST_AT_WALL)
+
+
+def _angles_of_generators(sheets: np.ndarray) -> tuple[np.ndarray, float]:
+    """Return the angles of the generators around a chord at which patches end in the directions `sheets` (m,).
+
+    With them is the distance of all from the chord, over h: the farther, the smaller the angle between two patches.
+    """
     sheets = np.sort(sheets % (2 * math.pi))
-    beside = choose_angles(sheets.tolist(), [])
+    beside = choose_angles(sheets.tolist(), [], _APART)
+    reach = min(max(_REACH, _HEIGHT / math.sin(beside.min())), _LONGEST_REACH)
+    apart = 2 * math.asin(0.5 / reach)
     found = []
     for k, (sheet, mine) in enumerate(zip(sheets, beside, strict=True)):
         after, other = sheets[(k + 1) % len(sheets)], beside[(k + 1) % len(sheets)]
@@ -119,9 +144,9 @@ def _angles_of_generators(sheets: np.ndarray) -> np.ndarray:
         if left < 1e-6:  # both have the same generator
             found.append([sheet + width * mine / (mine + other)])
         else:
-            n = max(round(left / (math.pi / 2)), 1)
+            n = max(round(left / apart), 1)
             found.append(sheet + mine + left * np.arange(n + 1) / n)
-    return np.concatenate(found)
+    return np.concatenate(found), reach
 
 
 def _place_around_edges(sheets: Sheets, domain: Domain, size: Callable[[np.ndarray], np.ndarray]) -> AroundCreases:
@@ -134,7 +159,7 @@ def _place_around_edges(sheets: Sheets, domain: Domain, size: Callable[[np.ndarr
     chains: list[ChainOfChords] = []
     for chain in np.unique(sheets.chain).tolist():
         for line, vertices, edges in _lines_inside(sheets, domain, np.flatnonzero(sheets.chain == chain)):
-            fold = _Fold(sheets, len(chains), line, vertices, edges, size)
+            fold = _Fold(sheets, len(chains), line, vertices, edges, size, domain)
             if not len(fold.h):
                 place = line.points[0]
                 raise InputError(
@@ -288,12 +313,13 @@ class _Sample:
         on_wall = ~_inside(domain, foot[there])
         clear = np.ones(len(self.cloud), bool)
         clear[there[~on_wall]] = False
+        clear &= ~_beside_nodes(around, self.cloud, h)
         self.raised = _relaxed(self.lifted, h**-2, h, np.column_stack([q, apart * patch]), count, clear)
         self.q, self.patch = self.raised[:, :3].copy(), np.rint(self.raised[:, 3] / apart).astype(int)
         feet = self._feet(self.q[n_fixed:], self.patch[n_fixed:])
         h = np.asarray(size(feet.point), float)
         self.q[n_fixed:], normals = feet.point, sheets.normals_at(feet)
-        height = self._heights(feet.point, normals, h)
+        height = self._heights(feet.point, normals, h, self.patch[n_fixed:])
         for sign in (1, -1):
             self.points += [*(feet.point + sign * height[:, None] * normals)]
             self.heights += [*height]
@@ -305,9 +331,9 @@ class _Sample:
         self._center(places)
         self._add_balls(places)
 
-    def _heights(self, q: np.ndarray, normals: np.ndarray, h: np.ndarray) -> np.ndarray:
-        """Return h / 2, or less where a wall that the surface meets at an angle leaves less room, (n,)."""
-        height = 0.5 * h
+    def _heights(self, q: np.ndarray, normals: np.ndarray, h: np.ndarray, patch: np.ndarray) -> np.ndarray:
+        """Return h / 2, or less where a wall or another patch leaves less room, (n,)."""
+        height = np.minimum(0.5 * h, np.maximum(self._gaps(q, normals, h, patch) / _OF_GAP, _LEAST_HEIGHT * h))
         for _ in range(_SHRINKAGES):
             narrow = np.zeros(len(q), bool)
             for sign in (1, -1):
@@ -317,6 +343,20 @@ class _Sample:
                 break
             height[narrow] *= _SHRINKAGE
         return height
+
+    def _gaps(self, q: np.ndarray, normals: np.ndarray, h: np.ndarray, patch: np.ndarray) -> np.ndarray:
+        """Return how far the next of the other patches is above or below the points `q` (n, 3) of patches, (n,)."""
+        gap = np.full(len(q), math.inf)
+        for other, triangles in enumerate(self.sheets.patches):
+            rows = np.flatnonzero(patch != other)
+            for sign in (1, -1):
+                x = q[rows] + 0.5 * sign * h[rows, None] * normals[rows]
+                feet = triangles.feet(x, 2 * float(h.max(initial=0)))
+                way = feet.point - q[rows]
+                up = sign * np.einsum("ij,ij->i", way, normals[rows])
+                opposite = (feet.triangle >= 0) & (up > _OPPOSITE * np.linalg.norm(way, axis=1))
+                gap[rows[opposite]] = np.minimum(gap[rows[opposite]], up[opposite])
+        return gap
 
     def _feet(self, x: np.ndarray, patch: np.ndarray) -> Feet:
         """Return the nearest points of patches."""
@@ -454,6 +494,18 @@ class _Sample:
             np.array([ball for balls in self.balls for ball in balls], np.int32),
             np.empty((0, 3)),
         )
+
+
+def _beside_nodes(around: AroundCreases, points: np.ndarray, h: np.ndarray) -> np.ndarray:
+    """Return for which `points` (n, 3) of patches generators at the height h / 2 are in a ball around an edge, (n,)."""
+    found = np.zeros(len(points), bool)
+    if len(around.centers):
+        tree, radii = scipy.spatial.KDTree(points), np.array(around.radii)
+        for x, r, near in zip(around.centers, radii, tree.query_ball_point(around.centers, radii), strict=True):
+            near = np.array(near, int)
+            away2 = ((points[near] - x) ** 2).sum(axis=1) + 0.25 * h[near] ** 2
+            found[near[away2 < r * r]] = True
+    return found
 
 
 def _cloud(sheets: Sheets, domain: Domain, size: Callable[[np.ndarray], np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
