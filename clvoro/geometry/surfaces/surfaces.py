@@ -33,6 +33,8 @@ _EXPECTED = (
 )
 _FLAT = 1 - 1e-9
 """Least cosine between the normals of a flat patch."""
+_ON_WALL = 1e-7
+"""Triangles whose corners are this near to the walls, over the domain's extent, lie on them."""
 _SMALL = 1e-3
 """Faces smaller than this, over the 2/3 power of the smaller cell's volume, do not connect regions."""
 
@@ -85,14 +87,6 @@ class Surfaces(Borders):
         self.part = part[first]
         self.sheets = Sheets.of(places, triangles[first], math.radians(self.angle), "surfaces")
         self.surface = self.sheets.surface
-        pairs = self.surface.crossings()
-        if len(pairs):
-            one, other = (self.names[k] for k in self.part[pairs[0]])
-            place = format_point(self.surface.corners[pairs[0, 0]].mean(axis=0))
-            raise InputError(
-                f"surfaces {one!r} and {other!r} cross or cover each other at {place}, expected surfaces that meet in "
-                "common triangles or edges only; cut them where they meet in the program that made them"
-            )
 
     def __repr__(self) -> str:
         return f"Surfaces({', '.join(self.names)}: {len(self.surface)} triangles)"
@@ -111,9 +105,12 @@ class Surfaces(Borders):
         }
 
     def check_within(self, domain: Domain) -> None:
-        """Raise an `InputError` if the surfaces are outside of a domain, or reach its periodic sides."""
+        """Raise an `InputError` if surfaces are outside of a domain, reach its periodic sides, or cross each other there.
+
+        Where they cross on the walls or beyond them does not matter, such as caps of nested pipes that leave the domain.
+        """
         corners = self.surface.corners
-        low, high = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
+        low, high, extent = corners.min(axis=(0, 1)), corners.max(axis=(0, 1)), float(domain.extent.max())
         if (low >= domain.upper).any() or (high <= domain.lower).any():
             raise InputError(
                 f"surfaces are outside of {domain}, expected a part of one inside; do units of length agree?"
@@ -131,6 +128,21 @@ class Surfaces(Borders):
             raise InputError(
                 f"surfaces reach a periodic side of {domain} along {'xyz'[int(beyond.argmax())]}, expected surfaces "
                 "within the box there; use walls, or move the surfaces"
+            )
+
+        if len(pairs := self.surface.crossings()):
+            met = corners[pairs]
+            within = (met.max(axis=2) > domain.lower).all(axis=2) & (met.min(axis=2) < domain.upper).all(axis=2)
+            pairs = pairs[within.all(axis=1)]
+        if len(pairs):
+            off = domain.boundary_distance(corners[pairs].reshape(-1, 3)).reshape(-1, 2, 3) > _ON_WALL * extent
+            pairs = pairs[off.any(axis=(1, 2))]
+        if len(pairs):
+            one, other = (self.names[k] for k in self.part[pairs[0]])
+            place = format_point(corners[pairs[0, 0]].mean(axis=0))
+            raise InputError(
+                f"surfaces {one!r} and {other!r} cross or cover each other at {place}, expected surfaces that meet in "
+                "common triangles or edges only; cut them where they meet in the program that made them"
             )
 
     @cached_property
