@@ -132,14 +132,32 @@ class Rebuilt:
     """(m,) bool: faces in a polygon that are not on the bisector of their generators, since the boundary has cut off a
     part of a cell there, which another cell has adopted."""
 
-    def __init__(self, d: Diagram, dtype: object = None) -> None:
-        dim, n = d.domain.dim, len(d)
-        self.real = find_precision(d, dtype)
-        far = max(map(abs, (*d.domain.lower, *d.domain.upper)))
-        size = float(np.linalg.norm(d.domain.extent))
+    def __init__(self, d: Diagram, dtype: object = None, real: np.dtype | None = None) -> None:
+        n = len(d)
+        self.real = find_precision(d, dtype) if real is None else real
+        eps, fine = float(np.finfo(self.real).eps), np.finfo(float).eps
+        far, size = self._extent(d)
         # The host adds the origin in float64.
-        self.unit = float(np.finfo(self.real).eps) * size + np.finfo(float).eps * far
+        self.unit = eps * size + fine * far
         self.owner = np.repeat(np.arange(n), np.diff(d.neighbor_starts))
+        self._set_cells(d)
+        self.perimeters = np.bincount(self.owner, self.measures, minlength=n)
+        self._distances = np.linalg.norm(d.vertices[self.corners] - d.points[self.cells], axis=1)
+        self.reach = np.zeros(n)
+        np.maximum.at(self.reach, self.cells, self._distances)
+        self._vertex_count = len(d.vertices)
+        self.unit_of_cell = eps * self.reach + fine * far
+        self.period_off = eps * d.domain.frame[1] * d.domain.dim**0.5 / 2
+        given = getattr(d, "face_measures", None)
+        self.remade = given is not None and np.array_equal(given, self.measures)
+
+    def _extent(self, d: Diagram) -> tuple[float, float]:
+        """Return the distance of the domain from 0, and its size."""
+        return max(map(abs, (*d.domain.lower, *d.domain.upper))), float(np.linalg.norm(d.domain.extent))
+
+    def _set_cells(self, d: Diagram) -> None:
+        """Set faces, corners, volumes and centroids."""
+        dim, n = d.domain.dim, len(d)
         self.directions, self.spacings = _across(d, self.owner)
         {2: self._set_polygons, 3: self._set_polyhedra}[dim](d)
         self.measures = np.linalg.norm(self.areas, axis=1)
@@ -151,15 +169,6 @@ class Rebuilt:
         moments = [np.bincount(self.owner, cones * share * self.middles[:, k], n) for k in range(dim)]
         safe = np.where(self.volumes > 0, self.volumes, 1)
         self.centroids = np.stack(moments, axis=1) / safe[:, None]
-        self.perimeters = np.bincount(self.owner, self.measures, minlength=n)
-        self._distances = np.linalg.norm(d.vertices[self.corners] - d.points[self.cells], axis=1)
-        self.reach = np.zeros(n)
-        np.maximum.at(self.reach, self.cells, self._distances)
-        self._vertex_count = len(d.vertices)
-        self.unit_of_cell = float(np.finfo(self.real).eps) * self.reach + np.finfo(float).eps * far
-        self.period_off = float(np.finfo(self.real).eps) * d.domain.frame[1] * dim**0.5 / 2
-        given = getattr(d, "face_measures", None)
-        self.remade = given is not None and np.array_equal(given, self.measures)
 
     def _set_polygons(self, d: Diagram) -> None:
         """Set areas and middles of faces, and the corners of cells, in 2D."""
@@ -378,14 +387,12 @@ class SphereCells(Rebuilt):
     have two coordinates, along the tangents at the cell's generator.
     """
 
-    def __init__(self, d: Diagram, dtype: object = None, real: np.dtype | None = None) -> None:
-        sphere, n = d.domain.globe, len(d)
+    def _extent(self, d: Diagram) -> tuple[float, float]:
+        return d.domain.frame[1], 2 * d.domain.frame[1]
+
+    def _set_cells(self, d: Diagram) -> None:
+        sphere = d.domain.globe
         assert sphere is not None
-        self.real = find_precision(d, dtype) if real is None else real
-        radius, fine = sphere.radius, float(np.finfo(float).eps)
-        eps = float(np.finfo(self.real).eps)
-        self.unit = (2 * eps + fine) * radius
-        self.owner = np.repeat(np.arange(n), np.diff(d.neighbor_starts))
         first, last = d.half_faces.ends.T
         self.cells, self.corners = self.owner, first
         self._set_directions(d, sphere)
@@ -396,20 +403,10 @@ class SphereCells(Rebuilt):
         self.measures = arrays["face_measures"]
         self.middles = arrays["face_centroids"] - at
         self.centroids = arrays["centroids"] - d.points
-        corners = [sphere.wrap(y) / radius for y in (at, x[first], x[last])]
-        self.volumes = np.bincount(self.owner, radius**2 * triangle_areas(*corners), n)
-        self.perimeters = np.bincount(self.owner, self.measures, n)
-        self.adopted = np.zeros(len(self.owner), bool)
-        self._on_wall = self.adopted
+        corners = [sphere.wrap(y) / sphere.radius for y in (at, x[first], x[last])]
+        self.volumes = np.bincount(self.owner, sphere.radius**2 * triangle_areas(*corners), len(d))
+        self.adopted = self._on_wall = np.zeros(len(self.owner), bool)
         self._following = following(d.neighbor_starts)
-        self._distances = np.linalg.norm(x[first] - at, axis=1)
-        self.reach = np.zeros(n)
-        np.maximum.at(self.reach, self.cells, self._distances)
-        self._vertex_count = len(x)
-        self.unit_of_cell = eps * self.reach + fine * radius
-        self.period_off = 0.0
-        given = d._arrays.get("face_measures")
-        self.remade = given is not None and np.array_equal(d.face_measures, self.measures)
 
     def _set_directions(self, d: Diagram, sphere: Sphere) -> None:
         """Set tangents, directions to neighbors and distances of generators, and the corners that follow from them."""
