@@ -1,7 +1,8 @@
 /* Coarse graphs for multigrid by pairwise aggregation: cells that a heavy weight connects form one coarse cell.
 
    Row i of a graph is columns[starts[i] .. starts[i + 1]) with its weights. Entries of weight 0, entries with
-   columns[k] == i and negative columns (walls) are ignored.
+   columns[k] == i and negative columns (walls) are ignored. Columns from n on are cells of other parts: they add to sums
+   of weights and to coarse graphs, but are in no aggregate.
 
    One work-item per cell or aggregate, unless a kernel says otherwise. Each work-item reads only results of earlier
    kernels, so the outcome does not depend on their order. */
@@ -78,7 +79,7 @@ kernel void choose_neighbor(int n, int matched, global const int *starts, global
         REAL most = 0;
         for (int k = starts[i]; k < starts[i + 1]; ++k) {
             const int j = columns[k];
-            if (j < 0 || j == i || (mate[j] != NONE) != matched)
+            if (j < 0 || j >= n || j == i || (mate[j] != NONE) != matched)
                 continue;
             const REAL p = break_tie(weights[k] * (inverse_sums[i] + inverse_sums[j]), i, j);
             if (p > most) {
@@ -141,7 +142,7 @@ inline int is_first_entry(int i, int k, global const int *starts, global const i
 
 /* Members of aggregate g: the two mates, then the cells that have chosen the first mate, then those that have chosen
    the second. With `fill` they are written from members[member_starts[g]] on; without it member_starts[g] becomes
-   their number. */
+   their number. `choice` of cells of other parts is NONE. */
 kernel void list_members(int n_aggregates, int fill, global const int *starts, global const int *columns,
                          global const int *mate, global const int *choice, global const int *roots,
                          global int *member_starts, global int *members)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pyopencl as cl
@@ -14,6 +14,7 @@ from ..opencl.device_array import read_number
 from ..opencl.engine import Engine
 from ..opencl.kernels import Kernels
 from ..opencl.primitives import NamedArrays, Scan
+from ..tessellation.part import Ghosts
 
 MATCHING_ROUNDS = 3
 """Rounds of matching per pass. The third still matches every fifth cell; a fourth is not worth its time."""
@@ -39,14 +40,22 @@ class Graph:
         Entries on the diagonal are ignored. Negative columns (walls) have weight 0.
     weights : (m,) real
         Symmetric, >= 0.
+    ghosts : Ghosts, optional
+        Who owns the cells of other parts, the columns from n on.
     """
 
     starts: cla.Array
     columns: cla.Array
     weights: cla.Array
+    ghosts: Ghosts | None = None
 
     def __len__(self) -> int:
         return len(self.starts) - 1
+
+    @property
+    def count(self) -> int:
+        """Number of cells, with those of other parts."""
+        return len(self) + (0 if self.ghosts is None else len(self.ghosts.parts))
 
     @property
     def rows(self) -> tuple[cla.Array, cla.Array, cla.Array]:
@@ -60,16 +69,19 @@ class Aggregates:
 
     Attributes
     ----------
-    aggregate : (n,) int32
-        Number of each cell's aggregate.
+    aggregate : (n or more,) int32
+        Number of each cell's aggregate, and of those of other parts.
     starts : (aggregates + 1,) int32
     members : (n,) int32
         Aggregate g has the cells ``members[starts[g]:starts[g + 1]]``.
+    ghosts : Ghosts, optional
+        Who owns the aggregates of other parts.
     """
 
     aggregate: cla.Array
     starts: cla.Array
     members: cla.Array
+    ghosts: Ghosts | None = None
 
     def __len__(self) -> int:
         return len(self.starts) - 1
@@ -142,7 +154,7 @@ class Aggregation:
             self.engine.run_blocks(
                 kernels.find_largest_weight, np.int32(len(graph)), graph.starts, graph.weights, partial
             )
-            largest = float(partial.get().max())
+            largest = max(float(found.max()) for found in self.engine.peers.gather(partial.get()))
             self.exponent = -math.frexp(largest)[1] if 0 < largest < math.inf else 0
             if source == self.engine.real and abs(self.exponent) <= _EXPONENT_RANGE:
                 self.exponent = 0
@@ -151,7 +163,7 @@ class Aggregation:
         weights = self._room(level, "weights", size=m)
         exponent = np.int32(self.exponent)
         self._run(kernels.scale_weights, m, np.int32(m), exponent, graph.weights, weights)
-        return Graph(graph.starts, graph.columns, weights)
+        return replace(graph, weights=weights)
 
     def coarsen(self, graph: Graph, level: int) -> tuple[PairInverse, Aggregates, Graph]:
         """Return the smoother of `graph`, its aggregates, and the coarse graph.
@@ -164,7 +176,8 @@ class Aggregation:
             inverse, first = self._aggregate(graph, level)
             middle = self._coarse_graph(graph, first, 1.0)
             _, second = self._aggregate(middle)
-            ratio = (len(second) / n) ** (1 / dim)
+            count, n = self.engine.peers.total([len(second), n]).tolist() if graph.ghosts else (len(second), n)
+            ratio = (count / n) ** (1 / dim)
             coarse = self._coarse_graph(middle, second, ratio, level)
             assert inverse is not None
             return inverse, self._compose(first, second, level), coarse
@@ -221,10 +234,12 @@ class Aggregation:
         """Do one pass: return the smoother (if a `level` is given) and the aggregates, in the workspace."""
         run, k, n, scratch = self._run, self._kernels, len(graph), self.engine.scratch
         size, ints = np.int32(n), np.int32
-        aggregate, members, starts = scratch(n, ints), scratch(n, ints), scratch(n + 1, ints)
+        aggregate, members, starts = scratch(graph.count, ints), scratch(n, ints), scratch(n + 1, ints)
         with self.engine.workspace.frame():
-            mate, choice, numbers = scratch(n, ints), scratch(n, ints), scratch(n + 1, ints)
+            mate, choice, numbers = scratch(n, ints), scratch(graph.count, ints), scratch(n + 1, ints)
             mate.fill(-1)
+            if graph.ghosts is not None:
+                choice.fill(-1)
             inverse, sums = None, self._inverse_sums(graph)
             for turn in range(MATCHING_ROUNDS):
                 self._match(graph, sums, mate, choice)
@@ -238,7 +253,25 @@ class Aggregation:
             run(k.number_aggregates, n, size, mate, choice, numbers, aggregate, roots)
             lists = (graph.starts, graph.columns, mate, choice, roots, starts)
             self._list(k.list_members, count, lists, starts, members)
-        return inverse, Aggregates(aggregate, starts[: count + 1], members)
+        ghosts = None if graph.ghosts is None else self._ghosts_of(graph.ghosts, n, count, aggregate)
+        return inverse, Aggregates(aggregate, starts[: count + 1], members, ghosts)
+
+    def _ghosts_of(self, fine: Ghosts, n: int, count: int, aggregate: cla.Array) -> Ghosts:
+        """Return who owns the aggregates of the ghosts `fine`, and number these in `aggregate`, from `count` on.
+
+        The owners have sent the numbers that aggregates have there. Both sides list them in ascending order.
+        """
+        engine, peers = self.engine, self.engine.peers
+        fine.fill(engine, n, aggregate)
+        host = aggregate.get()
+        parts, owned = np.asarray(fine.parts, int), host[n:].astype(int)
+        names, places = np.unique(parts << 32 | owned, return_inverse=True)
+        host[n:] = count + places.ravel()
+        aggregate.set(host)
+        assert fine.sent is not None
+        ends = np.cumsum(fine.sent_counts)[:-1]
+        sent = [np.unique(host[rows]) for rows in np.split(fine.sent.get(), ends)]
+        return Ghosts.of_lists(engine, peers, names >> 32, (names & 0xFFFFFFFF).astype(np.int32), sent)
 
     def _list(
         self, kernel: cl.Kernel, count: int, lists: tuple[cla.Array, ...], starts: cla.Array, members: cla.Array
@@ -263,7 +296,7 @@ class Aggregation:
         run(k.count_coarse_entries, count, number, *graph.rows, *lists, starts)
         self._scan.exclusive(starts, starts, count)
         entries = read_number(starts, count)
-        coarse = Graph(starts, array("columns", entries, np.int32), array("weights", entries))
+        coarse = Graph(starts, array("columns", entries, np.int32), array("weights", entries), aggregates.ghosts)
         scale = self.engine.real.type(factor)
         run(k.sum_coarse_weights, count, number, scale, *graph.rows, *lists, *coarse.rows)
         if level is not None:
@@ -274,11 +307,12 @@ class Aggregation:
     def _compose(self, inner: Aggregates, outer: Aggregates, level: int) -> Aggregates:
         """Return the aggregates of two passes, as a partition of the cells."""
         room = self._room
-        n, count = len(inner.aggregate), len(outer)
+        n, count = len(inner.members), len(outer)
         both = Aggregates(
             room(level, "aggregate", size=n, dtype=np.int32),
             room(level, "starts", size=count + 1, dtype=np.int32),
             room(level, "members", size=n, dtype=np.int32),
+            outer.ghosts,
         )
         self._run(self._kernels.compose_aggregates, n, np.int32(n), inner.aggregate, outer.aggregate, both.aggregate)
         lists = (outer.starts, outer.members, inner.starts, inner.members, both.starts)

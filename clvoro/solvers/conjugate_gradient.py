@@ -293,6 +293,7 @@ class _Iteration:
         # On CPUs it costs more to evaluate directions of neighbors again than to store them.
         self._merged = operator.rows is not None and self._engine.group_size > 1
         directions = (self._p, scratch(n, store)) if self._merged else (self._p, self._p)
+        self._sums = (_NORM_R, _SUM_R, _GAMMA) if isinstance(precondition, cla.Array) else (_NORM_R, _SUM_R)
         self._size, self._center = np.int32(n), np.int32(all_n if operator.singular else 0)
         # The recurrence stops slightly below the tolerance, so that the true residual is within it.
         limit = self._engine.real.type(0.95 * tolerance)
@@ -360,6 +361,7 @@ class _Iteration:
         if not isinstance(self._precondition, cla.Array):
             self._precondition(self._r, self._u, self._q)
             self._dot_product(_GAMMA + (k & 1), self._r, self._u)
+            self._engine.sum_over_parts(self._tail[0], _GAMMA + (k & 1))
         direction, solution = self._find_direction[k & 1], self._update_solution[k & 1]
         direction()
         if not self._merged:
@@ -370,7 +372,7 @@ class _Iteration:
                 self._dot_product(CURVATURE, self._p, self._q)
             self._engine.sum_over_parts(self._tail[0], CURVATURE)
         solution()
-        self._engine.sum_over_parts(self._tail[0], *(row + (k + 1) % 2 for row in (_NORM_R, _SUM_R, _GAMMA)))
+        self._engine.sum_over_parts(self._tail[0], *(row + (k + 1) % 2 for row in self._sums))
 
     def record_norm(self) -> None:
         """Record the residual before the next iteration, and whether it is needed."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -60,7 +60,7 @@ class Cycle:
 
     def __init__(self, engine: Engine) -> None:
         self.engine = engine
-        self.merged = engine.group_size > 1
+        self.merged = engine.group_size > 1 and engine.peers.count == 1
         self._factor_of_group = _COARSE_FACTOR if self.merged else 1
         self._one_group_limit = self._factor_of_group * one_group_limit(engine)
         self._room = NamedArrays(engine)
@@ -73,9 +73,17 @@ class Cycle:
         self._packed: tuple[list[Level], tuple[cla.Array, ...]] = [], ()
         self.set_levels([], None)
 
-    def set_levels(self, levels: Sequence[Level], factor: cla.Array | None) -> None:
-        """Use these levels, the finest first. `factor` is the factorized coarsest level, if it is solved exactly."""
-        self._levels, self._factor = levels, factor
+    def set_levels(
+        self,
+        levels: Sequence[Level],
+        factor: cla.Array | None,
+        rest: Callable[[cla.Array, cla.Array], None] | None = None,
+    ) -> None:
+        """Use these levels, the finest first. `factor` is the factorized coarsest level, if it is solved exactly.
+
+        With other parts `rest` (b, x) solves on the level after these, x = M^-1 b.
+        """
+        self._levels, self._factor, self._rest = levels, factor, rest
         self._key: list[object] | None = None
 
     def enqueue(self, r: cla.Array, u: cla.Array, work: cla.Array | None) -> None:
@@ -86,20 +94,29 @@ class Cycle:
             self._set_launches(r, u, work)
             self._key = key
         for launch in self._launches:
-            self.engine.enqueue(*launch)
+            if callable(launch):
+                launch()
+            else:
+                self.engine.enqueue(*launch)
 
     def _set_launches(self, r: cla.Array, u: cla.Array, work: cla.Array | None) -> None:
         levels = self._levels
         self._source = r.dtype
         # The finest level uses the caller's vectors if they have the same precision.
-        in_place = work is not None and r.dtype == np.float32
+        in_place = work is not None and r.dtype == np.float32 and levels[0].graph.ghosts is None
         finest = [r, u, work] if in_place else self._make_vectors(0)
         self._vectors = [finest, *(self._make_vectors(depth) for depth in range(1, len(levels)))]
+        if self._rest is not None and levels[-1].aggregates is not None:
+            count = len(levels[-1].aggregates)
+            self._vectors.append([self._room("rest", name, size=count) for name in "bx"])
         # Levels that are smoothed by launches of their own.
         count = self._first_coarse()
         for depth in range(count):
             self._descend(depth, None if depth or in_place else r)
-        if count < len(levels):
+        if self._rest is not None:
+            rest, (b, x, *_) = self._rest, self._vectors[-1]
+            self._launches.append(lambda: rest(b, x))
+        elif count < len(levels):
             self._solve_coarse(count, *(None, None) if count or in_place else (r, u))
         for depth in reversed(range(count)):
             self._ascend(depth, None if depth or in_place else u)
@@ -116,7 +133,7 @@ class Cycle:
 
     def _make_vectors(self, depth: int) -> list[cla.Array]:
         """Return the right side, solution and defect of a level."""
-        return [self._room(depth, name, size=len(self._levels[depth])) for name in "bxt"]
+        return [self._room(depth, name, size=self._levels[depth].graph.count) for name in "bxt"]
 
     def _add(self, depth: int, name: str, size: int, *args: object, turn: int = 0) -> None:
         """Add a launch. Each level and `turn` has a separate kernel object, because an object keeps its arguments."""
@@ -153,8 +170,16 @@ class Cycle:
         if self.merged:
             self._add(depth, "restrict_new_defect", count, np.int32(n), *rows, b, x, *lists)
         else:
-            self._add(depth, "compute_defect", n, *rows, b, x, t)
+            self._compute_defect(depth)
             self._add(depth, "restrict_defect", count, t, *lists)
+
+    def _compute_defect(self, depth: int) -> None:
+        """Set t = b - A x. Other parts send their values of x before."""
+        graph, (b, x, t), engine = self._levels[depth].graph, self._vectors[depth], self.engine
+        if graph.ghosts is not None:
+            ghosts, n = graph.ghosts, len(graph)
+            self._launches.append(lambda: ghosts.fill(engine, n, x))
+        self._add(depth, "compute_defect", len(graph), *graph.rows, b, x, t)
 
     def _solve_coarse(self, depth: int, r: cla.Array | None, u: cla.Array | None) -> None:
         """Do the cycle from `depth` on by one work-group, from `r` and into `u`, if given."""
@@ -226,8 +251,8 @@ class Cycle:
 
     def _smooth(self, depth: int, damping: np.float32, u: cla.Array | None = None) -> None:
         """Do one step of smoothing in place, or into `u`."""
-        level, (b, x, t), n = self._levels[depth], self._vectors[depth], len(self._levels[depth])
-        self._add(depth, "compute_defect", n, *level.graph.rows, b, x, t)
+        level, (_, x, t), n = self._levels[depth], self._vectors[depth], len(self._levels[depth])
+        self._compute_defect(depth)
         if u is None:
             turn = int(damping is _LATE)
             self._add(depth, "smooth", n, damping, *level.pairs.blocks, t, x, turn=turn)

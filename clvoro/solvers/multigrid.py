@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
+import pyopencl as cl
 import pyopencl.array as cla
 
+from ..opencl.device_array import buffer_of
 from ..opencl.engine import Engine
 from ..opencl.primitives import NamedArrays
+from ..tessellation.part import Ghosts
 from .aggregation import Aggregation, Graph
 from .cycle import Cycle, Level
 
 _COARSEST = 64
 """Cells of the coarsest level, at most, if it is solved exactly."""
+GATHERED = 5000
+"""Cells of a level of all parts from which on each part has the whole level, and does the same as the others."""
 _MAX_LEVELS = 30
 _LEAST_COARSENING = 0.8
 """Ratio of the cells of two levels above which coarsening ends."""
@@ -38,6 +44,9 @@ class Multigrid:
     within [0, 1], and C is positive semidefinite, however much it overshoots. A level visited twice, 2 C - C A C, is
     not: with scaled weights C A can exceed 2 where weights vary strongly. Hence the V-cycle.
 
+    With other parts aggregates have cells of one part, and each step of a smoother needs values of the others. Levels
+    of at most `GATHERED` cells are gathered: each part does the rest of the cycle for all.
+
     Parameters
     ----------
     engine : Engine
@@ -52,6 +61,8 @@ class Multigrid:
         self._room = NamedArrays(self._single)
         self._levels: list[Level] = []
         self._factor: cla.Array | None = None
+        self._whole: Multigrid | None = None
+        self._rest: Callable[[cla.Array, cla.Array], None] | None = None
 
     def clear(self) -> None:
         """Free all levels."""
@@ -59,13 +70,14 @@ class Multigrid:
         self._cycle.clear()
         self._aggregation.clear()
         self._room.clear()
+        self._whole = None
 
     @property
     def sizes(self) -> list[int]:
         """Cells of each level, the finest first."""
         return [len(level) for level in self._levels]
 
-    def set_up(self, starts: cla.Array, columns: cla.Array, weights: cla.Array) -> None:
+    def set_up(self, starts: cla.Array, columns: cla.Array, weights: cla.Array, ghosts: Ghosts | None = None) -> None:
         """Build the levels for the operator (A x)_i = sum_k w_k (x_i - x_columns[k]).
 
         Parameters
@@ -74,26 +86,64 @@ class Multigrid:
         columns : (m,) int32
         weights : (m,) real
             Symmetric, >= 0. The arrays must not change while the levels are used.
+        ghosts : Ghosts, optional
+            Who owns the columns from n on. All parts call this and `apply` together.
         """
-        graph = self._aggregation.scale(Graph(starts, columns, weights), 0)
-        self._levels, self._factor = [], None
+        graph, peers = self._aggregation.scale(Graph(starts, columns, weights, ghosts), 0), self.engine.peers
+        self._levels, self._factor, rest = [], None, None
         while True:
             depth, n = len(self._levels), len(graph)
-            if n <= _COARSEST:
+            if ghosts is not None:
+                sizes = np.array(peers.gather(np.array(n)))
+                if sizes.sum() <= GATHERED or depth == _MAX_LEVELS:
+                    rest = self._gather(graph, sizes)
+                    break
+            elif n <= _COARSEST:
                 pairs = self._aggregation.match_pairs(graph, depth)
                 self._levels.append(Level(graph, pairs, None))
                 self._factorize(graph)
                 break
             pairs, aggregates, coarse = self._aggregation.coarsen(graph, depth)
-            if len(aggregates) > _LEAST_COARSENING * n or depth == _MAX_LEVELS:
+            if ghosts is None and (len(aggregates) > _LEAST_COARSENING * n or depth == _MAX_LEVELS):
                 # Few cells have neighbors; smoothing is enough.
                 self._levels.append(Level(graph, pairs, None))
                 break
             self._levels.append(Level(graph, pairs, aggregates))
             graph = coarse
-        self._cycle.set_levels(self._levels, self._factor)
+        self._rest = rest
+        self._cycle.set_levels(self._levels, self._factor, rest)
 
-    def update_finest(self, starts: cla.Array, columns: cla.Array, weights: cla.Array) -> None:
+    def _gather(self, graph: Graph, sizes: np.ndarray) -> Callable[[cla.Array, cla.Array], None]:
+        """Set up the levels from `graph` on for the cells of all parts, `sizes` (p,), and return what solves there."""
+        peers, n, firsts = self.engine.peers, len(graph), np.cumsum(sizes) - sizes
+        assert graph.ghosts is not None
+        starts, first = graph.starts.get(), int(firsts[peers.number])
+        rows = np.concatenate([first + np.arange(n), firsts[graph.ghosts.parts] + graph.ghosts.rows.get()])
+        columns, weights = (array.get()[: starts[-1]] for array in (graph.columns, graph.weights))
+        columns = np.where(columns < 0, columns, rows[np.maximum(columns, 0)]).astype(np.int32)
+        given = np.diff(starts), columns, weights
+        counts, columns, weights = (np.concatenate(peers.exchange([array] * peers.count)) for array in given)
+        if self._whole is None:
+            self._whole = Multigrid(self.engine.alone())
+        whole, engine = self._whole, self._single
+        whole.set_up(
+            engine.upload(np.append(0, np.cumsum(counts)), np.int32),
+            engine.upload(columns, np.int32),
+            engine.upload(weights, np.float32),
+        )
+        b_of_all, x_of_all, work = (engine.empty(int(sizes.sum()), np.float32) for _ in range(3))
+
+        def solve(b: cla.Array, x: cla.Array) -> None:
+            b_of_all.set(np.concatenate(peers.exchange([b.get()[:n]] * peers.count, sizes)))
+            whole.apply(b_of_all, x_of_all, work)
+            if n:
+                cl.enqueue_copy(engine.queue, buffer_of(x), buffer_of(x_of_all), byte_count=4 * n, src_offset=4 * first)
+
+        return solve
+
+    def update_finest(
+        self, starts: cla.Array, columns: cla.Array, weights: cla.Array, ghosts: Ghosts | None = None
+    ) -> None:
         """Replace the operator by a similar one on the same cells: recompute only the smoother of the finest level.
 
         The cycle stays positive definite with any coarse correction. That of a slightly different graph is nearly as
@@ -101,15 +151,18 @@ class Multigrid:
 
         Parameters
         ----------
-        starts, columns, weights
+        starts, columns, weights, ghosts
             As for `set_up`, which has been called for as many cells.
         """
-        graph = Graph(starts, columns, weights)
+        if not self._levels:  # all are gathered
+            self.set_up(starts, columns, weights, ghosts)
+            return
+        graph = Graph(starts, columns, weights, ghosts)
         graph = self._aggregation.scale(graph, 0, same_exponent=True)
         finest = self._levels[0]
         self._aggregation.update_pairs(graph, finest.pairs)
         self._levels[0] = replace(finest, graph=graph)
-        self._cycle.set_levels(self._levels, self._factor)
+        self._cycle.set_levels(self._levels, self._factor, self._rest)
 
     def _factorize(self, graph: Graph) -> None:
         """Factorize the coarsest level."""
@@ -127,4 +180,11 @@ class Multigrid:
         work : (n,) of the same, optional
             Overwritten.
         """
+        if self._rest is not None and not self._levels:
+            single = self._room("b", size=len(r))
+            single.set(r.get().astype(np.float32))
+            x = self._room("x", size=len(r))
+            self._rest(single, x)
+            u.set(x.get().astype(u.dtype))
+            return
         self._cycle.enqueue(r, u, work)

@@ -24,7 +24,7 @@ from .linear_system import BreakdownError, Limits, Operator, Precondition, Solut
 from .multigrid import Multigrid
 
 if TYPE_CHECKING:
-    from ..tessellation.part import Part
+    from ..tessellation.part import Ghosts, Part
 
 SINGLE_PRECISION_TOLERANCE = 1e-3
 """Tolerance from which on weights and the iteration's vectors are in float32 and the recurrence's residual is trusted.
@@ -90,6 +90,11 @@ class Laplacian:
     def rows(self) -> tuple[cla.Array, cla.Array, cla.Array]:
         """The three arrays, as kernels take them."""
         return self.starts, self.neighbors, self.weights
+
+    @property
+    def ghosts(self) -> Ghosts | None:
+        """Who owns neighbors in other parts."""
+        return None if self.part is None else self.part.ghosts
 
 
 @dataclass(frozen=True)
@@ -244,9 +249,9 @@ class Poisson:
         if self._multigrid_of is laplacian:
             return self._multigrid
         if self._can_reuse(ordering):
-            self._multigrid.update_finest(*laplacian.rows)
+            self._multigrid.update_finest(*laplacian.rows, laplacian.ghosts)
         else:
-            self._multigrid.set_up(*laplacian.rows)
+            self._multigrid.set_up(*laplacian.rows, laplacian.ghosts)
             self._first_iterations = self._last_iterations = 0
         self._multigrid_of, self._ordering = laplacian, ordering
         return self._multigrid
@@ -288,7 +293,7 @@ class Poisson:
             the cheaper one by `expected_costs`: on CPUs, at tolerances of 1e-8 and 1e-2, multigrid from about 2000 and
             3400 cells on in 2D, from 18,000 and 56,000 in 3D. If multigrid breaks down, stagnates early, or does not
             converge in 200 iterations without `max_iterations`, Jacobi's preconditioner continues; `Solution.reason`
-            says so. With other parts it is "jacobi".
+            says so.
         ordering : object, optional
             The same object as in an earlier call states that the cells are the same, in the same order, and have moved
             little. The coarse levels of the multigrid are then reused.
@@ -320,9 +325,9 @@ class Poisson:
         operator = Operator(self._apply_of(laplacian), writes_curvature=True, singular=True, rows=rows, part=part)
         system = _Equation(laplacian, operator, rhs, potential, tolerance)
         if part is not None:
-            preconditioner, n = "jacobi", int(self.engine.peers.total(n))
+            n = int(self.engine.peers.total(n))
         if preconditioner == "auto":
-            one_group = n <= one_group_limit(self.engine)
+            one_group = part is None and n <= one_group_limit(self.engine)
             factors = cost_factors(self.engine.queue.device)
             jacobi, multigrid = expected_costs(n, self.engine.cell_dim, tolerance, one_group, factors)
             preconditioner = "multigrid" if multigrid < jacobi else "jacobi"
@@ -389,7 +394,7 @@ class Poisson:
             system.potential.fill(0)
         done = len(residuals) - 1
         if max_iterations is None:
-            most = max_jacobi_iterations(len(system.rhs))
+            most = max_jacobi_iterations(int(self.engine.peers.total(len(system.rhs))))
         else:
             most = max(max_iterations - done, 0)
         second = self._solve_jacobi(system, most, from_zero=False)

@@ -117,7 +117,7 @@ class BallGroups:
     """
 
     def __init__(self, centers: np.ndarray, radii: np.ndarray, order: np.ndarray, firsts: np.ndarray, own: int) -> None:
-        self.centers, self.radii = centers[order], radii[order]
+        self.centers, self.radii, self.order = centers[order], radii[order], order
         self.ends = np.append(firsts, len(order))
         lower, upper = (f.reduceat(self.centers, firsts, axis=0) for f in (np.minimum, np.maximum))
         self.largest = np.maximum.reduceat(self.radii, firsts)
@@ -146,12 +146,10 @@ class BallGroups:
         away[near] = reach[near]
         return Facing(facts, away, places, others, np.sqrt(ways2))
 
-    def wanted(self, facing: Facing) -> np.ndarray:
-        """Return the balls with their skins, (m, d + 1), in which the other part may have generators."""
-        radii = (1 + SKIN) * self.radii
+    def meeting(self, facing: Facing) -> np.ndarray:
+        """Return which balls, with their skins, meet a box in which the other part has generators, (m,) int."""
         holds = facing.facts[facing.others, -1] > 0
-        rows = np.unique(facing.places[holds & (facing.ways <= radii[facing.places])])
-        return np.column_stack([self.centers[rows], radii[rows]])
+        return np.unique(facing.places[holds & (facing.ways <= (1 + SKIN) * self.radii[facing.places])])
 
 
 @dataclass(frozen=True)
@@ -175,6 +173,45 @@ class Facing:
     ways: np.ndarray
 
 
+@dataclass(frozen=True)
+class Answers:
+    """What parts have answered to requests of each other.
+
+    Attributes
+    ----------
+    balls : BallGroups
+        Those of this part.
+    asked : (m,) int
+        Which of them may have unknown generators.
+    facing : dict of Facing
+        By the numbers of the other parts.
+    given : list of (k,) int32
+        For each part those of the own generators in its balls that it does not know.
+    new : list of (k, d + 2) float
+        What each part has given: rows, whether they are needed, and positions.
+    """
+
+    balls: BallGroups
+    asked: np.ndarray
+    facing: dict[int, Facing]
+    given: list[np.ndarray]
+    new: list[np.ndarray]
+
+    @property
+    def needed(self) -> int:
+        """Number of generators that this part needs."""
+        return int(sum(rows[:, 1].sum() for rows in self.new))
+
+    def shrink(self) -> None:
+        """Make the balls smaller, so that no new generator is nearer to one of them than a skin."""
+        places, balls = np.concatenate([rows[:, 2:] for rows in self.new]), self.balls
+        if len(places) and len(self.asked):
+            tree = scipy.spatial.cKDTree(places)
+            radii = balls.radii[self.asked]
+            near, _ = tree.query(balls.centers[self.asked], distance_upper_bound=(1 + SKIN) * radii.max())
+            balls.radii[self.asked] = np.minimum(radii, near - SKIN * radii)
+
+
 def gaps(boxes: np.ndarray, others: np.ndarray) -> np.ndarray:
     """Return the distances between `boxes` (k, 2 d) and `others` (m, 2 d), (k, m)."""
     dim = boxes.shape[1] // 2
@@ -194,9 +231,11 @@ def inside(points: np.ndarray, balls: np.ndarray) -> np.ndarray:
     With one more coordinate, sqrt(R^2 - r^2) of a ball with radius r <= R and 0 of a point, they are those that are
     nearer than R to one of the centers.
     """
+    if not len(points) or not len(balls):
+        return np.zeros(len(points), bool)
     radii = balls[:, -1]
     largest = radii.max()
-    centers = np.column_stack([balls[:, :-1], np.sqrt(largest**2 - radii**2)])
+    centers = np.column_stack([balls[:, :-1], np.sqrt((largest - radii) * (largest + radii))])
     places = np.column_stack([points, np.zeros(len(points))])
     near, _ = scipy.spatial.cKDTree(centers).query(places, distance_upper_bound=largest * (1 + 1e-9))
     return np.isfinite(near)
@@ -255,7 +294,10 @@ class PartSteps(DomainSteps):
         self._sent = [np.empty(0, np.int32) for _ in range(count)]
         self._parts, self._rows = np.empty(0, int), np.empty(0, np.int32)
         self._caps = FIRST_REACH[self._reads_rows] * self._chunks.spacings
-        self._ask(x, np.empty(0, int), self._caps)
+        none = np.empty(0, int)
+        answers = self._ask(x, none, self._caps, self._caps)
+        self._take(answers)
+        self._limit(answers, len(x), none)
         self._store()
 
     def _store(self) -> None:
@@ -363,9 +405,14 @@ class PartSteps(DomainSteps):
         while True:
             # A cell without the ghosts around it may reach through the whole domain.
             radii = np.minimum(GROWTH * needed, 2 * self._caps[rows])
-            found = self._ask(x, ghosts, radii)
+            answers = self._ask(x, ghosts, radii, np.minimum(needed, radii))
             self._caps[rows] = np.maximum(self._caps[rows], radii)
-            new, short = self.peers.total(np.array([found, (needed > radii).any()]))
+            new, short = self.peers.total(np.array([answers.needed, (needed > radii).any()]))
+            if new:
+                self._take(answers)
+            else:
+                answers.shrink()
+            self._limit(answers, len(x), ghosts)
             if new:
                 self._store()
                 return False
@@ -373,8 +420,8 @@ class PartSteps(DomainSteps):
                 self._note(part.points)
                 return True
 
-    def _ask(self, x: np.ndarray, ghosts: np.ndarray, radii: np.ndarray) -> int:
-        """Ask for the generators in balls around own generators and `ghosts`, and return how many ghosts are new.
+    def _ask(self, x: np.ndarray, ghosts: np.ndarray, radii: np.ndarray, needed: np.ndarray) -> Answers:
+        """Ask for the generators in balls around own generators and `ghosts`.
 
         Parameters
         ----------
@@ -382,7 +429,8 @@ class PartSteps(DomainSteps):
             Positions of the generators, and of ghosts.
         ghosts : (k,) int
             Rows in `x`.
-        radii : (n + k,) float
+        radii, needed : (n + k,) float
+            Of the balls, and of those that the present cells need.
         """
         self.asked += 1
         own, n = self._chunks, len(self._chunks.order)
@@ -391,39 +439,55 @@ class PartSteps(DomainSteps):
         firsts = np.concatenate([own.firsts, np.arange(n, len(radii), GROUP)])
         centers = np.concatenate([x[:n], x[ghosts]])
         balls = BallGroups(centers, radii, order, firsts, len(own.firsts))
-        told = self.peers.exchange([balls.facts] * self.peers.count)
-        others = [number for number in range(self.peers.count) if number != self.peers.number]
-        facing = {number: balls.facing(told[number]) for number in others}
-        wanted = [np.empty((0, x.shape[1] + 1))] * self.peers.count
-        for number in others:
-            wanted[number] = balls.wanted(facing[number])
-        wanted = self.peers.exchange(wanted)
-        found = [self._unknown(balls, given, sent) for given, sent in zip(wanted, self._sent, strict=True)]
-        self._sent = [np.concatenate(pair) for pair in zip(self._sent, found, strict=True)]
-        new = self.peers.exchange(found)
-        self._parts = np.concatenate([self._parts, np.repeat(np.arange(len(new)), [len(rows) for rows in new])])
-        self._rows = np.concatenate([self._rows, *new])
-        self._limits = np.full((len(x), 2), np.inf)
-        self._limits[n:, 0] = 0
-        self._limits[ghosts, 0] = radii[n:]
-        self._limits[own.order] = np.column_stack(self._limits_of(balls, facing))
-        self._at = None
-        return sum(map(len, new))
+        told, peers = self.peers.exchange([balls.facts] * self.peers.count), self.peers
+        facing = {number: balls.facing(told[number]) for number in range(peers.count) if number != peers.number}
+        none = np.empty(0, int)
+        asked = [balls.meeting(facing[number]) if number in facing else none for number in range(peers.count)]
+        sizes = np.column_stack([needed[order], (1 + SKIN) * balls.radii])
+        wanted = peers.exchange([np.hstack([balls.centers[rows], sizes[rows]]) for rows in asked])
+        given, sent = [], []
+        for requested, known in zip(wanted, self._sent, strict=True):
+            rows, places = self._unknown(balls, requested, known)
+            necessary = inside(places, requested[:, :-1])
+            given.append(rows)
+            sent.append(np.column_stack([rows, necessary, places]))
+        return Answers(balls, np.unique(np.concatenate(asked)), facing, given, peers.exchange(sent))
 
-    def _unknown(self, own: BallGroups, balls: np.ndarray, known: np.ndarray) -> np.ndarray:
-        """Return the own generators in `balls` (m, d + 1) that are not among the `known` ones, (k,) int32."""
+    def _take(self, answers: Answers) -> None:
+        """Add what parts have given to the lists of ghosts."""
+        self._sent = [np.concatenate(pair) for pair in zip(self._sent, answers.given, strict=True)]
+        numbers = np.repeat(np.arange(len(answers.new)), [len(rows) for rows in answers.new])
+        rows = np.concatenate([rows[:, 0] for rows in answers.new]).astype(np.int32)
+        self._parts, self._rows = np.concatenate([self._parts, numbers]), np.concatenate([self._rows, rows])
+
+    def _limit(self, answers: Answers, count: int, ghosts: np.ndarray) -> None:
+        """Set the limits of `count` rows, of which `ghosts` are those of ghosts with balls."""
+        n, order = len(self._chunks.order), self._chunks.order
+        self._limits = np.full((count, 2), np.inf)
+        self._limits[n:, 0] = 0
+        radii = np.empty(n + len(ghosts))
+        radii[answers.balls.order] = answers.balls.radii
+        self._limits[ghosts, 0] = radii[n:]
+        self._limits[order] = np.column_stack(self._limits_of(answers.balls, answers.facing))
+        self._at = None
+
+    def _unknown(self, own: BallGroups, balls: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the own generators in `balls` (m, d + 2) that are not among the `known` ones, and their positions.
+
+        Rows of balls end with a radius that does not count, and their own.
+        """
+        chunks, dim = self._chunks, own.centers.shape[1]
         if not len(balls):
-            return np.empty(0, np.int32)
-        chunks, dim = self._chunks, balls.shape[1] - 1
+            return np.empty(0, np.int32), np.empty((0, dim))
+        balls = np.delete(balls, dim, axis=1)
         firsts = np.arange(0, len(balls), GROUP)
         lower = np.minimum.reduceat(balls[:, :dim] - balls[:, dim:], firsts, axis=0)
         groups = np.hstack([lower, np.maximum.reduceat(balls[:, :dim] + balls[:, dim:], firsts, axis=0)])
         near = (gaps(own.boxes[: len(chunks.firsts)], groups) <= 0).any(axis=1)
         places = np.flatnonzero(np.repeat(near, np.diff(np.append(chunks.firsts, len(chunks.order)))))
-        rows = chunks.order[places]
-        unknown = ~np.isin(rows, known)
-        rows, places = rows[unknown], places[unknown]
-        return rows[inside(own.centers[places], balls)].astype(np.int32) if len(rows) else np.empty(0, np.int32)
+        places = places[~np.isin(chunks.order[places], known)]
+        places = places[inside(own.centers[places], balls)]
+        return chunks.order[places].astype(np.int32), own.centers[places]
 
     def _limits_of(self, balls: BallGroups, facing: dict[int, Facing]) -> tuple[np.ndarray, np.ndarray]:
         """Return the limits of own generators along the curve, (n,) each; see `is_within_limits` in part.cl.

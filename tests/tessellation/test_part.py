@@ -10,6 +10,7 @@ from clvoro.adaptation.insertion_deletion import CellSizes, Change, Generators
 from clvoro.adaptation.stages import Stages
 from clvoro.geometry.box import Box
 from clvoro.opencl.peers import ALONE
+from clvoro.solvers import multigrid
 from clvoro.solvers.linear_system import Limits
 from clvoro.solvers.volume_projection import Penalty, Targets
 from clvoro.tessellation.part import Ghosts, Part
@@ -178,11 +179,17 @@ def test_the_laplacian_of_two_halves(ctx, dim, real):
     assert np.abs(halves.joined(found) - whole).max() < 1e4 * np.finfo(real).eps * np.abs(whole).max()
 
 
-@pytest.mark.sparse(2)
+@pytest.mark.sparse(4)
+@pytest.mark.parametrize("gathered", [None, 5000, 50])
 @pytest.mark.parametrize("from_zero", [True, False])
 @pytest.mark.parametrize("real", REALS)
-def test_the_poisson_equation_in_two_halves(ctx, dim, real, from_zero):
-    """Both halves iterate together: products take values from the other half, sums are over both."""
+def test_the_poisson_equation_in_two_halves(ctx, dim, real, from_zero, gathered, monkeypatch):
+    """Both halves iterate together: products take values from the other half, sums are over both.
+
+    By Jacobi's preconditioner, by multigrid on all cells in each half, and with aggregates within halves.
+    """
+    preconditioner = "jacobi" if gathered is None else "multigrid"
+    monkeypatch.setattr(multigrid, "GATHERED", gathered or 0)
     halves, rng = Halves(ctx, dim, real), np.random.default_rng(60105)
     tolerance = 1e-9 if real == np.float64 else 1e-4
     source, start = (rng.standard_normal(halves.n).astype(real) for _ in range(2))
@@ -192,7 +199,7 @@ def test_the_poisson_equation_in_two_halves(ctx, dim, real, from_zero):
         with engine.workspace.frame():
             matrix = poisson.assemble(t.starts, t.neighbors, t.face_measures, part.points, part=part)
             phi, rhs = (engine.upload(values[rows[: t.n]]) for values in (start, source))
-            given = {"tolerance": tolerance, "preconditioner": "jacobi", "from_zero": from_zero}
+            given = {"tolerance": tolerance, "preconditioner": preconditioner, "from_zero": from_zero}
             solution = poisson.solve(matrix, rhs, phi, **given)
             assert solution.converged
             return phi.get(), solution.iterations
