@@ -1,8 +1,8 @@
 /* Coarse graphs for multigrid by pairwise aggregation: cells that a heavy weight connects form one coarse cell.
 
    Row i of a graph is columns[starts[i] .. starts[i + 1]) with its weights. Entries of weight 0, entries with
-   columns[k] == i and negative columns (walls) are ignored. Columns from n on are cells of other parts: they add to sums
-   of weights and to coarse graphs, but are in no aggregate.
+   columns[k] == i and negative columns (walls) are ignored. Columns from n on are cells of other parts: they add to
+   sums of weights and to coarse graphs, but are in no aggregate.
 
    One work-item per cell or aggregate, unless a kernel says otherwise. Each work-item reads only results of earlier
    kernels, so the outcome does not depend on their order. */

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pyopencl as cl
@@ -14,7 +15,9 @@ from ..opencl.device_array import read_number
 from ..opencl.engine import Engine
 from ..opencl.kernels import Kernels
 from ..opencl.primitives import NamedArrays, Scan
-from ..tessellation.part import Ghosts
+
+if TYPE_CHECKING:
+    from ..tessellation.part import Ghosts
 
 MATCHING_ROUNDS = 3
 """Rounds of matching per pass. The third still matches every fifth cell; a fourth is not worth its time."""
@@ -271,7 +274,7 @@ class Aggregation:
         assert fine.sent is not None
         ends = np.cumsum(fine.sent_counts)[:-1]
         sent = [np.unique(host[rows]) for rows in np.split(fine.sent.get(), ends)]
-        return Ghosts.of_lists(engine, peers, names >> 32, (names & 0xFFFFFFFF).astype(np.int32), sent)
+        return fine.of_lists(engine, peers, names >> 32, (names & 0xFFFFFFFF).astype(np.int32), sent)
 
     def _list(
         self, kernel: cl.Kernel, count: int, lists: tuple[cla.Array, ...], starts: cla.Array, members: cla.Array

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pyopencl as cl
@@ -12,9 +13,11 @@ import pyopencl.array as cla
 from ..opencl.device_array import buffer_of
 from ..opencl.engine import Engine
 from ..opencl.primitives import NamedArrays
-from ..tessellation.part import Ghosts
 from .aggregation import Aggregation, Graph
 from .cycle import Cycle, Level
+
+if TYPE_CHECKING:
+    from ..tessellation.part import Ghosts
 
 _COARSEST = 64
 """Cells of the coarsest level, at most, if it is solved exactly."""
