@@ -59,7 +59,7 @@ class Adapter:
     comm : mpi4py.MPI.Comm, optional
         Share runs among the ranks of this communicator: all of them create an adapter and call `run` with the same
         arguments. Each gets a `Result` of its own cells, and ``result.gather()`` returns the whole mesh on rank 0. For
-        boxes with walls, not for "transport", moving meshes, layers, fixed generators and checkpoints. Without `ctx`
+        boxes with walls, not for "transport", moving meshes, layers and fixed generators. Without `ctx`
         the ranks of a node take its GPUs in turn.
     share_gpus : bool
         Whether several ranks may have one GPU, which is refused otherwise.
@@ -506,7 +506,7 @@ class Adapter:
                 kept.release()  # buffers of a diagram, or of a failed run, are not part of this run's memory
             stages = self._stages_for(domain, self._peers)
             if self._peers.shared:
-                check_shared(domain, merged, fixed, checkpoint)
+                check_shared(domain, merged, fixed)
             with report_builds(stages.engine, self.on_build) as notice:
                 shown = self._shown(callback, notice)
                 stages.engine.pool.on_work = self.on_work

@@ -4,6 +4,9 @@ A checkpoint has what the rest of a run follows from: generators in the order of
 velocities, starts of the solvers, weights, the history, and the state of the schedule. It is taken at the end of an
 action. The run that goes on computes everything else anew from there, and so does the run that is resumed: both have
 the same bits. The size field and the schedule are computed again and compared with the file.
+
+Over ranks each writes its generators to a piece, a file of its own beside the checkpoint. When all pieces are on the
+disk, rank 0 replaces the checkpoint, which names them. Then the pieces of earlier checkpoints are removed.
 """
 
 from __future__ import annotations
@@ -12,6 +15,8 @@ import dataclasses
 import hashlib
 import json
 import os
+import re
+import secrets
 import time
 from collections.abc import Sequence
 from os import PathLike
@@ -21,9 +26,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..arguments import check_path, warn
-from ..errors import CheckpointWarning, InputError, OutputError
+from ..errors import CheckpointWarning, InputError, OutputError, RankError
 from ..geometry.domain import Domain
 from ..mesh.results import HISTORY_DTYPE, Displacements
+from ..opencl.peers import ALONE, Peers
+from ..tessellation.decomposition import distribute
 from .insertion_deletion import Generators
 from .plan.actions import Action, Step
 from .preparation import GivenPoints
@@ -32,7 +39,7 @@ from .state import Arrays, MeshState, Setup
 if TYPE_CHECKING:
     from .run import Run
 
-FORMAT, VERSION = "clvoro-checkpoint", 11
+FORMAT, PIECE, VERSION = "clvoro-checkpoint", "clvoro-checkpoint-piece", 11
 _GENERATORS = tuple(field.name for field in dataclasses.fields(Generators))
 _OTHERS = ("potential", "multipliers", "weights")
 _COUNTS = ("position", "level", "levels", "n_start", "started", "steps", "next_label", "pace")
@@ -50,9 +57,13 @@ class Checkpointer:
         See `run_fingerprint`.
     schedule : list of Action
         Before it begins.
+    peers : Peers
+        The parts of the run. All of them write together.
     """
 
-    def __init__(self, path: str | PathLike[str], every: float, fingerprint: dict, schedule: list[Action]) -> None:
+    def __init__(
+        self, path: str | PathLike[str], every: float, fingerprint: dict, schedule: list[Action], peers: Peers = ALONE
+    ) -> None:
         from ..io import check_writable
 
         path = check_path("checkpoint", path)
@@ -60,7 +71,7 @@ class Checkpointer:
             raise InputError(f"checkpoint is {path!r}, a folder, expected the name of a file")
         check_writable(path)
         _check_overwrite(path)
-        self.path, self.every, self.fingerprint = Path(path), every, fingerprint
+        self.path, self.every, self.fingerprint, self.peers = Path(path), every, fingerprint, peers
         self.schedule = schedule_digest(schedule)
         self._last = time.monotonic()
 
@@ -69,11 +80,11 @@ class Checkpointer:
 
         If it cannot be written, because the disk is full for instance, the run continues and the last one stays.
         """
-        if not stop and time.monotonic() - self._last < self.every:
+        if not self.peers.any(stop or time.monotonic() - self._last >= self.every):
             return
         try:
             self.write(run)
-        except OutputError as error:
+        except (OutputError, RankError) as error:
             warn(f"{error}. The run continues without this checkpoint; the last one is unchanged", CheckpointWarning)
         self._last = time.monotonic()
 
@@ -90,8 +101,8 @@ class Checkpointer:
         mesh, kept = run.state, run.state.arrays
         found = {name: getattr(kept.generators, name) for name in _GENERATORS}
         found |= {name: getattr(kept, name) for name in _OTHERS if getattr(kept, name) is not None}
-        arrays = {f"mesh.{name}": array.get() for name, array in found.items()}
-        arrays |= {"mesh.h": mesh.h.get(), "taken": mesh.taken, "history": np.concatenate(run.rows)}
+        rows = {f"mesh.{name}": array.get() for name, array in found.items()} | {"mesh.h": mesh.h.get()}
+        arrays: dict[str, Any] = {"taken": mesh.taken, "history": np.concatenate(run.rows)}
         for part in ("initial", "final"):
             if getattr(run, part) is not None:
                 arrays |= {f"{part}.{name}": array for name, array in vars(getattr(run, part)).items()}
@@ -110,8 +121,39 @@ class Checkpointer:
             "methods": [_state_of(method) for method in _methods_of(run.schedule)],
         }
         about = {"fingerprint": self.fingerprint, "schedule": self.schedule, "state": state}
+        pieces: list[tuple[str, int]] = []
+        if self.peers.count == 1:
+            arrays |= rows
+        else:
+            about["pieces"] = pieces = self._write_piece(rows)
         arrays["about"] = np.array(json.dumps(about))
-        write_arrays(self.path, FORMAT, VERSION, arrays, compress=False)
+
+        def write_index() -> None:
+            if self.peers.number == 0:
+                write_arrays(self.path, FORMAT, VERSION, arrays, compress=False)
+
+        self.peers.agree(write_index)
+        if self.peers.count > 1:
+            self._remove_others({name for name, _ in pieces})
+
+    def _write_piece(self, rows: dict[str, np.ndarray]) -> list[tuple[str, int]]:
+        """Write the `rows` of this part; return names and numbers of rows of the pieces of all parts, on the disk."""
+        from ..io.arrays import write_arrays
+
+        peers = self.peers
+        mark, *_ = peers.gather(np.array(secrets.randbits(62)))
+        names = [f"{self.path.name}.{int(mark):016x}.{part}" for part in range(peers.count)]
+        counts = [int(count) for count in peers.gather(np.array(len(rows["mesh.h"])))]
+        path = self.path.with_name(names[peers.number])
+        peers.agree(lambda: write_arrays(path, PIECE, VERSION, rows, compress=False))
+        return list(zip(names, counts, strict=True))
+
+    def _remove_others(self, names: set[str]) -> None:
+        """Remove all pieces of this checkpoint's path but those with these `names`."""
+        for path in self.path.parent.iterdir():
+            start, end = path.name[: len(self.path.name)], path.name[len(self.path.name) :]
+            if start == self.path.name and re.fullmatch(r"\.[0-9a-f]{16}\.[0-9]+", end) and path.name not in names:
+                path.unlink(missing_ok=True)
 
 
 class Saved:
@@ -120,6 +162,8 @@ class Saved:
     Parameters
     ----------
     path : str or path
+    peers : Peers
+        The parts of the run that goes on: each takes its share of the generators.
 
     Attributes
     ----------
@@ -134,10 +178,10 @@ class Saved:
         If the file is missing, damaged, truncated or not a checkpoint.
     """
 
-    def __init__(self, path: str | PathLike[str]) -> None:
+    def __init__(self, path: str | PathLike[str], peers: Peers = ALONE) -> None:
         from ..io.arrays import read_arrays
 
-        self.name = check_path("resume", path)
+        self.peers, self.name = peers, check_path("resume", path)
         self.arrays = read_arrays(self.name, FORMAT, VERSION)
         version = self.arrays["version"].item()
         if version != VERSION:
@@ -153,6 +197,7 @@ class Saved:
                 raise ValueError("counts")
             self.size_factor = float.fromhex(state["size_factor"])
             self.elapsed = float(state["elapsed"])
+            self._take_rows([(str(name), int(count)) for name, count in about.get("pieces", [])])
             near, replaced, why = state["given"]
             self.levels, self.given = int(state["levels"]), GivenPoints(bool(near), bool(replaced), str(why))
             if not (0 < self.size_factor < np.inf and 0 <= self.elapsed < np.inf and state["level"] <= self.levels):
@@ -160,6 +205,35 @@ class Saved:
             self._check(len(self.fingerprint["domain"]["lower"]), np.dtype(self.fingerprint["dtype"]))
         except (KeyError, ValueError, TypeError, AttributeError, IndexError, RecursionError) as error:
             raise self._damaged(error) from error
+
+    def _take_rows(self, pieces: list[tuple[str, int]]) -> None:
+        """Read the generators of this part from the `pieces`, names and numbers of rows, or take them from the file.
+
+        As many parts as pieces have the same generators as before.
+        """
+        from ..io.arrays import read_arrays
+
+        part, parts = self.peers.number, self.peers.count
+        counts = [count for _, count in pieces] or [len(self.arrays["mesh.points"])]
+        self.moves = parts != len(counts) and parts > 1
+        ends = np.cumsum(counts)
+        begin, end = (ends[-1] * k // parts for k in (part, part + 1))
+        if parts == len(counts):
+            begin, end = ends[part] - counts[part], ends[part]
+        found = []
+        for k, (last, count) in enumerate(zip(ends, counts, strict=True)):
+            first, stop = max(begin, last - count), min(end, last)
+            if first > stop or (first == stop and k):
+                continue
+            given = self.arrays
+            if pieces:
+                given = read_arrays(Path(self.name).with_name(Path(pieces[k][0]).name), PIECE, VERSION)
+            if len(given["mesh.points"]) != count:
+                raise ValueError(f"piece {k}")
+            rows = slice(first - last + count, stop - last + count)
+            found.append({name: array[rows] for name, array in given.items() if name.startswith("mesh.")})
+        for name in found[0]:
+            self.arrays[name] = np.concatenate([given[name] for given in found])
 
     def _damaged(self, error: Exception | str) -> InputError:
         return InputError(f"cannot resume from {self.name}: it is damaged ({error!r:.200})")
@@ -186,6 +260,7 @@ class Saved:
                 raise ValueError(name)
         labels = a["mesh.labels"]
         known = n > 0 and labels.min() >= 0 and labels.max() < self.state["next_label"]
+        known = known or (n == 0 and self.peers.count > 1)
         if not known or len(np.unique(labels)) < n:
             raise ValueError("labels")
         if not (a["mesh.h"] > 0).all():
@@ -222,23 +297,31 @@ class Saved:
             If schedule or size field differ from those of the saved run.
         """
         engine, a = setup.stages.engine, self.arrays
-        self._check_points(setup.domain)
-        saved, points = (engine.upload(a[f"mesh.{name}"], a[f"mesh.{name}"].dtype) for name in ("h", "points"))
-        self._compare_sizes(setup, saved, points)  # first: another size field has another schedule, too
-        if self.schedule != schedule_digest(schedule) or self.state["position"] > len(schedule):
-            raise InputError(
-                f"cannot resume from {self.name}: its plan of steps differs, as with another size "
-                "field or version of clvoro; use those of that run, or start again without resume"
-            )
+        self.peers.agree(lambda: self._compare(setup, schedule))
         on_device = {
             name.removeprefix("mesh."): engine.upload(array, array.dtype)
             for name, array in a.items()
             if name.startswith("mesh.") and name != "mesh.h"
         }
+        if self.moves:
+            on_device = distribute(engine, setup.domain, on_device)
         generators = Generators(**{name: on_device.pop(name) for name in _GENERATORS})
         others = (on_device.get(name) for name in _OTHERS)
         arrays = Arrays(generators, *others)  # type: ignore[arg-type]
         return MeshState(setup, self.size_factor, arrays, next_label=self.state["next_label"], taken=a["taken"])
+
+    def _compare(self, setup: Setup, schedule: list[Action]) -> None:
+        """Raise if the points are not in the domain, or schedule or size field differ from those of the saved run."""
+        engine, a = setup.stages.engine, self.arrays
+        if len(a["mesh.h"]):
+            self._check_points(setup.domain)
+            saved, points = (engine.upload(a[f"mesh.{name}"], a[f"mesh.{name}"].dtype) for name in ("h", "points"))
+            self._compare_sizes(setup, saved, points)  # first: another size field has another schedule, too
+        if self.schedule != schedule_digest(schedule) or self.state["position"] > len(schedule):
+            raise InputError(
+                f"cannot resume from {self.name}: its plan of steps differs, as with another size "
+                "field or version of clvoro; use those of that run, or start again without resume"
+            )
 
     def _check_points(self, domain: Domain) -> None:
         x = self.arrays["mesh.points"].astype(float)
@@ -277,7 +360,8 @@ class Saved:
         steps = [action for action in run.schedule[: run.position] if isinstance(action, Step)]
         run.last = steps[-1].method if steps else None
         run.rows = [row.reshape(1) for row in self.arrays["history"]]
-        run.initial, run.final = self._displacements("initial"), self._displacements("final")
+        if self.peers.count == 1:
+            run.initial, run.final = self._displacements("initial"), self._displacements("final")
         return self.elapsed
 
     def _displacements(self, part: str) -> Displacements | None:

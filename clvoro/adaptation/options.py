@@ -155,7 +155,8 @@ class PaperOptions:
 class Checkpoint:
     """A file from which a run continues after the process has ended.
 
-    The file is replaced only when the new one is complete. A file that is not a checkpoint is never replaced.
+    The file is replaced only when the new one is complete. A file that is not a checkpoint is never replaced. Over
+    ranks each has a piece beside the file, which a run on any number of ranks, or without ranks, continues.
 
     A run with checkpoints computes its mesh anew from the generators after every tenth step, whether or not it writes
     one there. So its mesh does not depend on the times of writing, and a resumed run has the same bits as one that was

@@ -71,15 +71,15 @@ def check_run(domain: object, size: object, callback: Callable[[np.void], object
         )
 
 
-def check_shared(domain: Domain, options: Options, fixed: object, checkpoint: object) -> None:
+def check_shared(domain: Domain, options: Options, fixed: object) -> None:
     """Raise if ranks cannot share such a run."""
     what = ""
     if not domain.may_have_parts:
         what = f"domain is {domain!r:.80}, expected a Box with walls, without lines or surfaces inside"
     elif options.method in ("transport", *MOVING):
         what = f"method is {options.method!r}, expected one other than {', '.join(map(repr, ('transport', *MOVING)))}"
-    elif options.layers or fixed is not None or checkpoint is not None:
-        what = "layers, fixed generators or a checkpoint are given, expected none of them"
+    elif options.layers or fixed is not None:
+        what = "layers or fixed generators are given, expected none of them"
     if what:
         raise InputError(f"{what}, since ranks share the run; use an Adapter without comm")
 
@@ -131,7 +131,8 @@ class Run:
         self._files, self._callback, self._on_memory, self._alone = files, callback, on_memory, alone
         # Over several parts displacements are not kept: generators change their part before the end.
         self._whole = stages.engine.peers.count == 1
-        self._begin(size, given, saved=None if files.source is None else Saved(files.source))
+        peers, source = stages.engine.peers, files.source
+        self._begin(size, given, saved=None if source is None else peers.agree(lambda: Saved(source, peers)))
 
     def __repr__(self) -> str:
         return (
@@ -155,7 +156,7 @@ class Run:
         if saved is not None or files.path is not None:
             fingerprint = run_fingerprint(self._domain, vars(options), stages.engine.real, points, self._fixed)
         if saved is not None:
-            saved.check_fingerprint(fingerprint)
+            stages.engine.peers.agree(lambda: saved.check_fingerprint(fingerprint))
             max_levels, given = saved.levels, saved.given
         used = None if given is not None and given.replaced else points
         prepared = stages.engine.peers.agree(
@@ -186,7 +187,8 @@ class Run:
         planned = plan(prepared, given.near)
         self._writer = None
         if files.path is not None:
-            self._writer = Checkpointer(files.path, files.every, fingerprint, planned.schedule)
+            path, peers = files.path, stages.engine.peers
+            self._writer = peers.agree(lambda: Checkpointer(path, files.every, fingerprint, planned.schedule, peers))
         self._renews = saved is not None or (self._writer is not None and files.every < math.inf)
         self.pace = RENEWAL if files.every else 0
         if saved is not None:
@@ -362,6 +364,8 @@ class Run:
                 while self._advance():
                     pass
             except KeyboardInterrupt:
+                if not self._whole:  # the other parts wait somewhere
+                    raise
                 self.stop_reason = INTERRUPTED
                 # Of a step that has not ended the generators are good: the run that is resumed does it again.
                 resumable = not self._acts or isinstance(self.schedule[self.position], Step)

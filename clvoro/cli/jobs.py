@@ -308,7 +308,7 @@ class Job:
                 f"{self.case.name}: {next(iter(given))} is for a run of one method, and the case has "
                 f"{len(self.case.methods)}; choose one with --method"
             )
-        if len(self.case.methods) > 1 or (self.peers.count > 1 and not given):
+        if len(self.case.methods) > 1:
             return None
         if self.checkpoint is None:  # written only if the run is stopped
             return Checkpoint(self.out / STATE, math.inf, self.resume)

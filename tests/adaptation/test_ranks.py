@@ -3,6 +3,7 @@
 import importlib.util
 import json
 import os
+import re
 import subprocess
 import sys
 import types
@@ -15,7 +16,8 @@ import clvoro
 from clvoro.cli.cases import load_case
 from clvoro.cli.jobs import Job
 from clvoro.cli.ranks import this_rank
-from clvoro.errors import InputError, InputTypeError, MissingLibraryError, RankError
+from clvoro.errors import CheckpointWarning, InputError, InputTypeError, MissingLibraryError, OutputError, RankError
+from clvoro.io import arrays
 from clvoro.opencl.peers import Peers
 from tests.reference.peers import run_parts
 
@@ -140,7 +142,47 @@ def test_a_run_in_parts(ctx, dim, tmp_path):
     assert np.array_equal(read.cell_data["error"], np.concatenate([mesh.size_error for mesh in meshes]))
 
 
-@pytest.mark.parametrize("change", [{"method": "transport"}, {"fixed": [(0.5, 0.5)]}, {"checkpoint": "run.npz"}])
+def test_checkpoints_are_resumed_on_any_number_of_parts(ctx, tmp_path, monkeypatch):
+    """On as many parts with the same bits; a piece that one part cannot write leaves the last checkpoint whole."""
+    given, state = (clvoro.Box((0, 0), (1, 1)), ramp(0.1)), tmp_path / "state"
+    options = {"effort": "fast", "checkpoint": clvoro.Checkpoint(state, 0)}
+    whole = run_in(2, ctx, *given, **options)[1]
+    stopped = run_in(2, ctx, *given, **options, callback=lambda row: row["step"] == 11)[1]
+    assert stopped.history["step"][-1] == 11
+    files = {file.name for file in tmp_path.iterdir()}
+    assert len(files) == 3
+    assert all(re.fullmatch(r"state(\.[0-9a-f]{16}\.[01])?", name) for name in files)
+
+    write = arrays.write_arrays
+
+    def fill_disk(path, *given, **how):
+        if str(path).endswith(".1"):
+            raise OutputError("no space left")
+        write(path, *given, **how)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(arrays, "write_arrays", fill_disk)
+        again = {"effort": "fast", "checkpoint": clvoro.Checkpoint(state, 0, resume=True)}
+        with pytest.warns(CheckpointWarning, match="no space left"):
+            run_in(2, ctx, *given, **again, callback=lambda row: row["step"] == 13)
+    resumed = run_in(2, ctx, *given, effort="fast", checkpoint=clvoro.Checkpoint(None, 0, resume=state))[1]
+    for name in ARRAYS:
+        assert np.array_equal(getattr(resumed, name), getattr(whole, name)), name
+    for parts in (1, 3):
+        other = run_in(parts, ctx, *given, effort="fast", checkpoint=clvoro.Checkpoint(None, 0, resume=state))[1]
+        assert other.check()
+        assert other.history["step"][-1] == whole.history["step"][-1]
+        assert abs(len(other) / len(whole) - 1) < 0.03
+        assert np.array_equal(other.history["cells"][:12], whole.history["cells"][:12])
+    alone = clvoro.Adapter(ctx).run(*given, effort="fast", checkpoint=clvoro.Checkpoint(state, 0, resume=True))
+    assert abs(alone.history["mean_error"][-1] / whole.history["mean_error"][-1] - 1) < 0.5
+    run_in(2, ctx, *given, **options, callback=lambda row: row["step"] == 1)
+    next(file for file in tmp_path.iterdir() if file.name.endswith(".1")).unlink()
+    with pytest.raises((InputError, RankError), match="No such file"):
+        run_in(2, ctx, *given, effort="fast", checkpoint=clvoro.Checkpoint(None, resume=state))
+
+
+@pytest.mark.parametrize("change", [{"method": "transport"}, {"fixed": [(0.5, 0.5)]}])
 def test_what_ranks_cannot_share_is_refused(ctx, change):
     with pytest.raises(InputError, match="ranks share the run"):
         run_in(1, ctx, clvoro.Box((0, 0), (1, 1)), 0.2, **change)
