@@ -25,6 +25,9 @@ RUNS = {
 }
 
 
+OF_BOXES = ("2D", "3D", "periodic")
+
+
 def assert_same(a, b):
     for name in ("points", "target_size", "size_error", "quality", "origin"):
         assert np.array_equal(getattr(a, name), getattr(b, name)), name
@@ -58,7 +61,7 @@ def test_stepped_runs_end_the_same(ctx, kind):
     assert_same(run.finish(), whole)
 
 
-@pytest.mark.parametrize("kind", ["2D", "3D", "polygon", "sphere", "periodic"])
+@pytest.mark.parametrize("kind", ["polygon", "sphere", *(pytest.param(k, marks=pytest.mark.slow) for k in OF_BOXES)])
 def test_runs_follow_other_sizes(ctx, kind):
     """As runs from the points that are there, whether or not they have ended."""
     domain, size, options = RUNS[kind]

@@ -169,11 +169,11 @@ def test_single_diagrams_of_graded_points_take_few_images(ctx):
 @pytest.mark.parametrize(("spread", "most"), [(0.01, 7), (None, 3)])
 def test_few_cells_are_built_for_clusters(ctx, monkeypatch, spread, most):
     """Gaps between clusters need images from far away: the cells built until they are there are counted."""
-    rng, n, built = np.random.default_rng(6), 4000, []
+    rng, n, built = np.random.default_rng(6), 2000, []
     points = rng.random((n, 3))
     if spread:
         points = (rng.random((20, 3))[rng.integers(0, 20, n)] + spread * rng.normal(size=(n, 3))) % 1
-    monkeypatch.setitem(images.SAMPLED_FROM, 3, 2000)
+    monkeypatch.setitem(images.SAMPLED_FROM, 3, 1000)
     plain = Polyhedra.tessellate
 
     def counted(cells, part, binned, start, exact, rows):
