@@ -24,8 +24,10 @@ from tests.reference.peers import run_parts
 ARRAYS = ("points", "volumes", "centroids", "neighbor_starts", "neighbors", "face_measures", "face_centroids")
 SCRIPT = """
 import clvoro, sys
+from clvoro.opencl import prebuild
 from mpi4py import MPI
 
+prebuild._start = lambda device: None  # no workers beside the ranks
 adapter = clvoro.Adapter(comm=MPI.COMM_WORLD)
 out = open(f"{sys.argv[1]}/{MPI.COMM_WORLD.rank}", "w")
 mesh = adapter.run(clvoro.Box((0, 0, 0), (1, 1, 1)), lambda p: 0.2 * (1 + p[:, 0]), effort="fast")
@@ -47,7 +49,9 @@ except Exception as error:
 COMMANDS = """
 import os, resource, sys
 from clvoro.cli import main
+from clvoro.opencl import prebuild
 
+prebuild._start = lambda device: None
 folder, pieces = sys.argv[1], ["--pieces", "--json"]
 for name, options in {"whole": ["--no-report"], "pieces": pieces, "missing": [], "full": pieces}.items():
     if name == "full" and os.environ["PMI_RANK"] == "1":
