@@ -99,8 +99,8 @@ class Setup:
         Generators with labels below `fixed` do not move.
     points : (k, d) ndarray
         Positions of those with the labels 0 to k - 1, on the finest level: first those of the caller, then those
-        around corners and creases, whose cells have target sizes like all others, then those beside lines. The other
-        fixed generators are those of layers. The size of the cells beside lines and in layers is their target size.
+        around corners and creases, then those beside lines. The other fixed generators are those of layers. The size
+        of the cells beside lines, in layers, and around crowded creases is their target size.
     factor : float
         Initial factor on the size field on the finest level.
     own_factor : float
@@ -121,9 +121,8 @@ class Setup:
 
     @property
     def first_sized(self) -> int:
-        """Label of the first generator beside lines or of layers."""
-        sized = 0 if self.around is None or not self.around.own_sizes else len(self.around)
-        return len(self.points) - sized
+        """Label of the first generator whose cell has the target size that it has."""
+        return len(self.points) - (0 if self.around is None else self.around.n_sized)
 
     @property
     def first_row(self) -> int:

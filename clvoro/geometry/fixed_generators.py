@@ -49,13 +49,16 @@ class FixedGenerators:
     balls: np.ndarray
     left_out: np.ndarray
 
-    own_sizes = False
-    """Whether the target size of these cells is the size that they have."""
     least_cells = 0
     """Least number of cells of a mesh for each of them."""
 
     def __len__(self) -> int:
         return len(self.points)
+
+    @property
+    def n_sized(self) -> int:
+        """Number of the last generators whose cells have as target size the size that they have."""
+        return 0
 
     def with_others(self, others: FixedGenerators | None, room: Callable[[np.ndarray], np.ndarray]) -> FixedGenerators:
         """Return these and those of `others` that are farther than room(points) from all of these."""

@@ -221,6 +221,13 @@ def test_a_crease_that_cannot_be_followed_is_left_out(ctx):
     assert d.volumes.sum() == pytest.approx(solid.measure, rel=0.01)
 
 
+def test_generators_around_concave_creases_stay_in_the_middle():
+    ledge = clvoro.Solid.extruded(clvoro.Polygon([(0, 0), (2, 0), (2, 1), (0.1, 1), (0.1, 2), (0, 2)]), 0, 1)
+    x = np.array([[0.05, 1.05, 0.5], [0.05, 1.7, 0.5], [0.05, 1.8, 0.5]])
+    moved = off_middle(WallSurface(ledge), x, np.full(len(x), 0.15))
+    assert (moved != x).any(axis=1).tolist() == [False, True, True]
+
+
 def test_a_plate_thinner_than_a_cell_keeps_its_cells(ctx):
     """Spread across it, its generators have cells that OpenFOAM accepts, but for those with few neighbors."""
     solid, rng = clvoro.Solid.box((0, 0, 0), (2, 2, 0.7 * H)), np.random.default_rng(1)

@@ -39,6 +39,8 @@ Each next one makes more cells convex, and leaves out more of the surface."""
 _THIN, _ACROSS = 0.7, 0.35
 """A part of a solid is thin if both walls are nearer to a generator than this share of h; how far generators are spread
 across it, over h."""
+_AROUND = 0.85
+"""Distance over h from a concave crease within which they stay, as their faces meet there."""
 _GOLDEN = (5**0.5 - 1) / 2
 _FEW = 0.03
 """Largest share of generators without a cell; a solid with more of them is refused."""
@@ -121,6 +123,8 @@ def off_middle(surface: WallSurface, points: np.ndarray, sizes: np.ndarray) -> n
     """
     near, foot, distance = _close_to(surface, points, _THIN * sizes)
     kept = distance < -0.05 * sizes[near]
+    edge = surface.nearest_crease(points[near], _AROUND * sizes[near])[0]
+    kept[edge >= 0] &= ~surface.solid.creases.concave[edge[edge >= 0]]
     near, foot, distance = near[kept], foot[kept], distance[kept]
     across = (points[near] - foot) / -distance[:, None]
     thin = surface.closest(points[near] + _THIN * sizes[near, None] * across)[2] > 0

@@ -58,7 +58,10 @@ class LinePairs(FixedGenerators):
     chords: np.ndarray
     sizes: np.ndarray
 
-    own_sizes = True
+    @property
+    def n_sized(self) -> int:
+        """Number of generators: all of them."""
+        return len(self)
 
 
 class _Piece(NamedTuple):

@@ -1,31 +1,45 @@
 """Stations: generators around concave creases and corners, placed so that faces between their cells meet there.
 
-Nodes divide a chain of creases into chords, equidistributed by 1 / h. Around each node is a ball without other
-generators. Beside a chord k generators stand where the spheres around its two ends intersect, in the middle of k equal
-sectors. With the interior angle alpha there, k = round(alpha / 90 degrees). So all their bisectors contain the chord,
-and each of the outermost two is nearest to one wall only. Where chains meet, the node in the corner is one of all of
-them. Generators of two chains that are near each other become one, on the spheres of both. Mirror images of the
-generators in the walls there complete the corner.
+Nodes divide a chain of creases into chords, equidistributed by 1 / h; a chain shorter than h is one chord. Around each
+node is a ball without other generators. Beside a chord k generators stand where the spheres around its two ends
+intersect, in the middle of k equal sectors. With the mean interior angle alpha of the chain, k = round(alpha / 90
+degrees), as far as sectors are 60 to 120 degrees wide then. So all their bisectors contain the chord, and each of the
+outermost two is nearest to one wall only. Where chains meet, the node in the corner is one of all of them. Generators
+of two chains that are near each other become one, on the spheres of both. Mirror images of the generators in the walls
+there complete the corner.
+
+Generators have no room if a wall or others are near, or if others are in a ball. They come nearer to their crease then,
+step by step; in the end those of the shortest chains are left out. The cells of those that are nearer are smaller than
+others, and their target size is the size that they have.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy
 
 from ..fixed_generators import FixedGenerators
+from .creases import connect
 
 if TYPE_CHECKING:
     from .solid import Solid
 
 _CLEAR = 1.06  # radius in which no other generators are, over that of the sphere
+_OTHERS = 0.97  # of a radius: generators that are this near to a node and not around it are in its ball
 _ROOM = 0.5  # of h: least distance of generators that are not the same
 _WALL = 0.3  # of h: least distance of generators from walls
+_SHORTEST = 0.3  # over h: shorter creases have no generators of their own
+_SHRINKAGE, _LEAST = 0.8, 0.2  # steps in which generators without room come nearer to a crease, and how near
+_SECTORS = math.radians(120), math.radians(60)  # widest and narrowest sectors of generators
+_WIDEST = math.radians(150)  # sectors where there is no room for more generators
+_SHORT = 0.8  # over the radii at its ends: the radii are the same at both ends of shorter chords
 _SAMPLES = 8  # of 1 / h per step, at least
 _FEWEST = 64  # samples per chain, at least
 _MOST = 1 << 16
@@ -46,10 +60,18 @@ class Stations(FixedGenerators):
         The size h of their cells.
     chain : (n,) int
         The chain that each one belongs to; -1 for those that complete a corner.
+    n_small : int
+        How many have no room for cells of the size h: the last ones.
     """
 
     size: np.ndarray
     chain: np.ndarray
+    n_small: int
+
+    @property
+    def n_sized(self) -> int:
+        """Number of the last generators whose cells have as target size the size that they have."""
+        return self.n_small
 
 
 @dataclass(frozen=True)
@@ -107,14 +129,29 @@ def place_stations(solid: Solid, size: Callable[[np.ndarray], np.ndarray]) -> St
     """Return the stations of a solid for the sizes h = size(points (n, 3))."""
     chains = [_Crease(solid, c, size) for c in np.unique(solid.creases.chain[solid.creases.concave]).tolist()]
     chains = [chain for chain in chains if len(chain.h)]
+    while True:
+        placing = _placed(solid, chains)
+        crowded = [placing.crowded(chain) for chain in chains]
+        if any([chain.shrink(where) for chain, where in zip(chains, crowded, strict=True)]):
+            continue
+        left = [k for k, where in enumerate(crowded) if where.any()]
+        if not left:
+            break
+        shortest = min(left, key=lambda k: len(chains[k].h))
+        chains[shortest].leave_out(crowded[shortest])
+    placing.leave_out()
+    placing.complete(solid)
+    return placing.stations()
+
+
+def _placed(solid: Solid, chains: Sequence[_Crease]) -> AroundCreases:
+    """Return the generators around `chains`, with one where those of two chains meet."""
     share_corners(chains)
     placing = AroundCreases(lambda x: -solid.signed_distance(x))
     for chain in chains:
         placing.add(chain)
     placing.join()
-    placing.leave_out()
-    placing.complete(solid)
-    return placing.stations()
+    return placing
 
 
 class ChainOfChords:
@@ -125,8 +162,8 @@ class ChainOfChords:
     number : int
     vertices : (2,) int
         Those at its ends.
-    h, middle : (n,) float
-        Of each chord: size, and length along the chain.
+    h, full, middle : (n,) float
+        Of each chord: size of the cells, their size where there is room, and length along the chain.
     lengths, ways : (n,) and (n, 3) float
         Of each chord: length, and unit vector.
     nodes, radii : (n + 1, 3) and (n + 1,) float
@@ -147,9 +184,11 @@ class ChainOfChords:
         vertices: np.ndarray,
         size: Callable[[np.ndarray], np.ndarray],
         ends: tuple[float, float] = (1.0, 1.0),
+        shortest: float = 0.5,
     ) -> None:
         self.number, self.line, self.vertices = number, line, vertices
-        at, self.middle, self.h = _divide(self.line, size, ends)
+        at, self.middle, self.h = _divide(self.line, size, ends, shortest)
+        self.full = self.h
         self.nodes = self.line.along(self.line.points, at)
         chords = np.diff(self.nodes, axis=0)
         self.lengths = np.linalg.norm(chords, axis=1)
@@ -176,28 +215,72 @@ class ChainOfChords:
 
 
 class _Crease(ChainOfChords):
-    """A concave crease: generators in the middle of equal sectors of its interior angle."""
+    """A concave crease: generators in the middle of equal sectors of its interior angle.
+
+    Attributes
+    ----------
+    angle : (n,) float
+        The interior angle at each chord, in radians.
+    scale : (n,) float
+        The size of the cells around each chord, over the full one.
+    spent : (n,) bool
+        Whether they are as small as may be.
+    """
 
     def __init__(self, solid: Solid, number: int, size: Callable[[np.ndarray], np.ndarray]) -> None:
-        super().__init__(number, chain_line(solid, number), solid.creases.vertices(number)[[0, -1]], size)
+        ends = solid.creases.vertices(number)[[0, -1]]
+        super().__init__(number, chain_line(solid, number), ends, size, shortest=_SHORTEST)
+        if len(self.h) == 1:  # cells go on beyond the ends of a crease shorter than h
+            self.full = np.maximum(self.h, size(self.line.along(self.line.points, self.middle)))
         left, right = (self.line.along(n, self.middle) for n in (self.line.left, self.line.right))
         left, right = (_unit(n - (n * self.ways).sum(axis=1)[:, None] * self.ways) for n in (left, right))
         sine, cosine = (np.cross(left, right) * self.ways).sum(axis=1), (left * right).sum(axis=1)
-        angle = math.pi - np.arctan2(sine, cosine)
-        count = np.maximum(2, np.rint(angle / (math.pi / 2))).astype(int)
+        self.angle = math.pi - np.arctan2(sine, cosine)
+        # One number along the chain, as far as its sectors allow that, since faces between two numbers are oblique.
+        usual = np.rint(self.angle.mean() / (math.pi / 2)) if len(self.angle) else 2
+        self.sectors = np.clip(usual, *(np.ceil(self.angle / most) for most in _SECTORS)).astype(int)
         self.axes = np.stack([np.cross(left, self.ways), -left], axis=1)
-        self.turns = [(np.arange(n) + 0.5) * (a / n) for n, a in zip(count.tolist(), angle, strict=True)]
-        half = 0.5 * angle / count
+        self.scale, self.spent = np.ones(len(self.h)), np.zeros(len(self.h), bool)
+        self._arrange()
+
+    def _arrange(self) -> None:
+        """Place the generators."""
+        self.h = self.full * self.scale
+        self.turns = [
+            (np.arange(n) + 0.5) * (a / max(n, 1)) for n, a in zip(self.sectors.tolist(), self.angle, strict=True)
+        ]
+        half = 0.5 * self.angle / np.maximum(self.sectors, 2)
         # A cell is a kite with the area h^2 whose tip is on the crease; its generator is at the centroid.
         self.set_radii(self.h / np.sqrt(np.tan(half)) * (np.cos(half) + 1 / np.cos(half)) / 3)
 
+    def shrink(self, crowded: np.ndarray) -> bool:
+        """Move the generators at `crowded` chords (n,) bool nearer to these; return whether that has been possible.
+
+        Where they are very near already, there are as few as may be from then on, again at the full distance.
+        """
+        crowded = crowded & ~self.spent
+        self.scale[crowded] *= _SHRINKAGE
+        low = crowded & (self.scale < _LEAST)
+        fewest = np.ceil(self.angle / _WIDEST).astype(int)
+        again = low & (fewest < self.sectors)
+        self.sectors[again], self.scale[again] = fewest[again], 1
+        self.spent |= low & ~again
+        self._arrange()
+        return bool(crowded.any())
+
+    def leave_out(self, chords: np.ndarray) -> None:
+        """Leave out the generators at `chords` (n,) bool."""
+        self.sectors[chords] = 0
+        self._arrange()
+
 
 def _divide(
-    line: Line, size: Callable[[np.ndarray], np.ndarray], ends: tuple[float, float]
+    line: Line, size: Callable[[np.ndarray], np.ndarray], ends: tuple[float, float], shortest: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the lengths along a line at the ends of chords, (n + 1,), in their middle, and the sizes there, (n,).
 
-    The first and the last chord are longer than the others by the factors `ends`.
+    The first and the last chord are longer than the others by the factors `ends`. A line shorter than `shortest`, over
+    h, has none.
     """
     total = float(line.at[-1])
     n = _FEWEST
@@ -208,7 +291,7 @@ def _divide(
         if n >= min(_SAMPLES * reached[-1], _MOST):
             break
         n = int(min(2 * _SAMPLES * reached[-1], _MOST))
-    count = round(float(reached[-1]) - sum(ends) + 2)
+    count = max(round(float(reached[-1]) - sum(ends) + 2), int(reached[-1] > shortest))
     if line.closed:
         count = max(count, 3)
     if ends == (1.0, 1.0):
@@ -226,15 +309,17 @@ def _divide(
 
 
 def share_corners(chains: Sequence[ChainOfChords]) -> None:
-    """Give the chains that meet in a corner one radius there."""
-    ends: dict[int, list[tuple[ChainOfChords, int]]] = {}
-    for chain in chains:
-        for end in (0, -1):
-            ends.setdefault(int(chain.vertices[end]), []).append((chain, end))
-    for meeting in ends.values():
-        radius = float(np.mean([chain.radii[end] for chain, end in meeting]))
-        for chain, end in meeting:
-            chain.radii[end] = radius
+    """Give the chains that meet in a corner one radius there, and to both ends of a single short chord as well."""
+    if not chains:
+        return
+    ends, at = np.unique([chain.vertices for chain in chains], return_inverse=True)
+    at = at.reshape(-1, 2)
+    short = [len(chain.h) == 1 and chain.lengths[0] < _SHORT * chain.radii[0] for chain in chains]
+    corner = connect(len(ends), at[short])[1][at].ravel()
+    radii = np.array([chain.radii[[0, -1]] for chain in chains])
+    shared = (np.bincount(corner, radii.ravel()) / np.bincount(corner))[corner].reshape(-1, 2)
+    for chain, (first, last) in zip(chains, shared, strict=True):
+        chain.radii[0], chain.radii[-1] = first, last
 
 
 class AroundCreases:
@@ -243,11 +328,14 @@ class AroundCreases:
     def __init__(self, depth: Callable[[np.ndarray], np.ndarray]) -> None:
         self.depth = depth
         self.points, self.sizes, self.chains = np.zeros((0, 3)), np.zeros(0), np.zeros(0, np.int64)
-        self.spots = np.zeros((0, 3))  # the middle of the chord of each generator
+        self.small = np.zeros(0, bool)  # whether there is less room than for cells of the size h
+        self.spots = np.zeros((0, 3))  # the middle of each chord
+        self.chords: list[list[int]] = []  # of each generator
         self.balls: list[list[int]] = []  # of each generator
         self.centers: list[np.ndarray] = []
         self.radii: list[float] = []
         self.lost = np.zeros((0, 3))
+        self.first_chord: dict[int, int] = {}
 
     def add(self, chain: ChainOfChords) -> None:
         """Add the generators and balls of a chain."""
@@ -256,15 +344,19 @@ class AroundCreases:
         self.radii += chain.radii.tolist()
         self.points = np.vstack([self.points, *(chain.around(i) for i in range(len(chain.h)))])
         self.sizes = np.append(self.sizes, chain.h[chord])
+        self.small = np.append(self.small, (chain.h < chain.full)[chord])
         self.chains = np.append(self.chains, np.full(len(chord), chain.number))
-        self.spots = np.vstack([self.spots, chain.line.along(chain.line.points, chain.middle)[chord]])
+        self.chords += [[len(self.spots) + i] for i in chord.tolist()]
+        self.first_chord[chain.number] = len(self.spots)
+        self.spots = np.vstack([self.spots, chain.line.along(chain.line.points, chain.middle)])
         self.balls += [[first + i, first + i + 1] for i in chord.tolist()]
 
     def keep(self, kept: np.ndarray) -> None:
-        """Keep some of the generators."""
+        """Keep some of the generators: those of these rows, or where (n,) bool is true."""
+        rows = np.arange(len(self.points))[kept].tolist()
         self.points, self.sizes, self.chains = self.points[kept], self.sizes[kept], self.chains[kept]
-        self.spots = self.spots[kept]
-        self.balls = [balls for balls, k in zip(self.balls, kept.tolist(), strict=True) if k]
+        self.small = self.small[kept]
+        self.balls, self.chords = ([x[k] for k in rows] for x in (self.balls, self.chords))
 
     def join(self, within: float = _EXACT) -> None:
         """Make one of two near generators of different chains, if there is a place on the spheres of both.
@@ -283,11 +375,14 @@ class AroundCreases:
             off = np.linalg.norm(point - np.array(self.centers)[balls], axis=1) / np.array(self.radii)[balls] - 1
             if near and np.abs(off).max() < within:
                 self.points[i], self.balls[i] = point, balls
+                self.chords[i] = self.chords[i] + self.chords[j]
                 kept[j] = False
         self.keep(kept)
 
     def near_pairs(self) -> list[tuple[int, int]]:
         """Return the pairs of generators without room for both, the closest first."""
+        if not len(self.points):
+            return []
         near = scipy.spatial.KDTree(self.points).query_pairs(_ROOM * self.sizes.max(), output_type="ndarray")
         distance = np.linalg.norm(self.points[near[:, 0]] - self.points[near[:, 1]], axis=1)
         near, distance = (a[distance < _ROOM * self.sizes[near].min(axis=1)] for a in (near, distance))
@@ -323,18 +418,53 @@ class AroundCreases:
             radii = np.sqrt(np.maximum(radii**2 + step[3 * n :] * start, 0.25 * start**2))
         self.radii = radii.tolist()
 
-    def leave_out(self) -> None:
-        """Leave out generators near others, near walls, or outside; note their places on creases."""
+    def crowded(self, chain: ChainOfChords) -> np.ndarray:
+        """Return at which chords of a chain generators are near others, near walls, or outside; (m,) bool."""
+        first = self.first_chord[chain.number]
+        return self._without_room[first : first + len(chain.h)]
+
+    @cached_property
+    def _without_room(self) -> np.ndarray:
+        """Whether each chord has no room, (c,) bool."""
+        crowded = ~self._deep()
+        crowded[np.array(self.near_pairs(), int).ravel()] = True
+        return self._chords_of(crowded | self._around_taken_balls())
+
+    def _around_taken_balls(self) -> np.ndarray:
+        """Return which generators are around balls in which there are others, (n,) bool."""
         if not len(self.points):
-            return
-        keep = self.depth(self.points) > _WALL * self.sizes
+            return np.zeros(0, bool)
+        inside = scipy.spatial.KDTree(self.points).query_ball_point(self.centers, _OTHERS * np.array(self.radii))
+        inside = [set(items) for items in inside]
+        mine: list[list[int]] = [[] for _ in self.centers]
+        for k, balls in enumerate(self.balls):
+            for b in balls:
+                mine[b].append(k)
+        found = np.zeros(len(self.points), bool)
+        for items, others in zip(mine, inside, strict=True):
+            found[items] |= not others.issubset(items)
+        return found
+
+    def _deep(self) -> np.ndarray:
+        """Return whether generators are far enough from walls, (n,) bool."""
+        return self.depth(self.points) > _WALL * self.sizes if len(self.points) else np.zeros(0, bool)
+
+    def _chords_of(self, chosen: np.ndarray) -> np.ndarray:
+        """Return which chords have one of the generators `chosen` (n,) bool, (c,) bool."""
+        found = np.zeros(len(self.spots), bool)
+        found[[c for chords in itertools.compress(self.chords, chosen) for c in chords]] = True
+        return found
+
+    def leave_out(self) -> None:
+        """Leave out generators near others, near walls, or outside; note the chords without any."""
+        keep = self._deep()
         for i, j in self.near_pairs():
             if keep[i] and keep[j]:
                 keep[j] = False
         # Without one of them, faces between the others may lie in a wall beyond the crease: all leave together.
-        self.lost, spot = np.unique(self.spots[~keep], axis=0), np.unique(self.spots, axis=0, return_inverse=True)[1]
-        keep &= ~np.isin(spot, spot[~keep])
-        self.keep(keep)
+        lost = self._chords_of(~keep)
+        self.keep(np.array([not lost[chords].any() for chords in self.chords], bool))
+        self.lost = self.spots[~self._chords_of(np.ones(len(self.points), bool))]
 
     def complete(self, solid: Solid) -> None:
         """Add the mirror images of generators at corners in the walls of `solid` there."""
@@ -354,7 +484,7 @@ class AroundCreases:
             added: list[np.ndarray] = []
             for _ in range(_ROUNDS):
                 images = (mine[:, None] - 2 * ((mine - x) @ walls.T)[:, :, None] * walls).reshape(-1, 3)
-                images = images[self.depth(images) > _WALL * h]
+                images = images[(self.depth(images) > _WALL * h) & ~self._in_balls(images)]
                 new = 0
                 for image in images:
                     others = np.vstack([self.points, *added])
@@ -366,11 +496,19 @@ class AroundCreases:
                     break
             self.points = np.vstack([self.points, *added])
             self.sizes = np.append(self.sizes, np.full(len(added), h))
+            self.small = np.append(self.small, np.full(len(added), self.small[near].any()))
             self.chains = np.append(self.chains, np.full(len(added), -1))
             self.balls += [[] for _ in added]
+            self.chords += [[] for _ in added]
+
+    def _in_balls(self, points: np.ndarray) -> np.ndarray:
+        """Return which points (m, 3) are in a ball, (m,) bool."""
+        away = np.linalg.norm(points[:, None] - np.array(self.centers), axis=2)
+        return (away < _OTHERS * np.array(self.radii)).any(axis=1)
 
     def stations(self) -> Stations:
         """Return what has been placed."""
+        self.keep(np.argsort(self.small, kind="stable"))
         used, balls = np.unique([ball for balls in self.balls for ball in balls], return_inverse=True)
         return Stations(
             self.points,
@@ -381,6 +519,7 @@ class AroundCreases:
             self.lost,
             self.sizes,
             self.chains,
+            int(self.small.sum()),
         )
 
 

@@ -69,12 +69,31 @@ def test_stations_follow_the_sizes_along_a_crease():
 
 def test_places_without_room_are_reported():
     """Above a ledge that is narrower than the cells, and in a run."""
-    ledge = Polygon([(0, 0), (1.05, 0), (1.05, 1), (1, 1), (1, 2), (0, 2)])
+    ledge = Polygon([(0, 0), (1.005, 0), (1.005, 1), (1, 1), (1, 2), (0, 2)])
     solid = Solid.extruded(ledge, 0, 0.6)
     left = solid.stations(lambda x: np.full(len(x), 0.2)).left_out
     assert left[:, :2] == pytest.approx(np.tile([1.0, 1.0], (3, 1)))
     with pytest.warns(MismatchWarning, match="no room at 3 places on concave creases, the first at \\(1, 1, 0.1\\)"):
         place_in_corners(solid, solid, *np.empty((2, 0, 3)), lambda x: np.full(len(x), 0.2), 1000)
+
+
+def test_generators_come_nearer_to_creases_where_there_is_little_room():
+    """Around a post and a wall with sides of h and 1.25 h. None of their creases is left out, and no ball is taken."""
+    h = 0.2
+    parts = cubes(*[(i, j, 0) for i in range(3) for j in range(3)], (1, 1, 1), (2, 1, 1), (2, 2, 1))
+    solid = Solid(parts.surface.vertices * [0.5, 0.25, 1.0], parts.surface.triangles)
+    stations = solid.stations(lambda x: np.full(len(x), h))
+    assert len(stations.left_out) == 0
+    assert 0 < stations.n_small < len(stations)
+    assert stations.size[: -stations.n_small] == pytest.approx(h, rel=0.3)
+    assert (stations.size[-stations.n_small :] < 0.81 * h).all()
+    assert (KDTree(stations.points).query(stations.centers)[0] > 0.9 * stations.radii).all()
+
+
+@pytest.mark.parametrize(("length", "count"), [(0.15, 0), (0.2, 3), (0.5, 3)])
+def test_short_creases_have_one_chord(length, count):
+    short = Solid.extruded(Polygon([(0, 0), (2, 0), (2, 1), (1, 1), (1, 2), (0, 2)]), 0, length)
+    assert len(short.stations(lambda x: np.full(len(x), 0.6))) == count
 
 
 def test_given_generators_in_balls_are_reported():
