@@ -26,6 +26,7 @@ from ..tessellation.decomposition import distribute, is_balanced
 from ..tessellation.device_diagram import Tessellation
 from ..tessellation.readback.diagram import order_of
 from ..tessellation.readback.parts import fetch_part
+from ..tessellation.readback.solid import mesh_volumes
 from ..tessellation.tessellator import Tessellator
 from .density import CellWeights
 from .fixed_points import clear_balls, take_places
@@ -518,10 +519,25 @@ class MeshState:
             w = self.stages.density.cell_weights(self.t, self.h)
             self.summaries.collect("log_ratio", w.log_ratio, self.n)
         free = self.total - max(self.fixed - self.setup.first_row, 0)
-        factor = math.exp(self.summaries.read_one("log_ratio").sum / free / self.engine.cell_dim)
+        self.multiply_sizes(math.exp(self.summaries.read_one("log_ratio").sum / free / self.engine.cell_dim))
+
+    def multiply_sizes(self, factor: float) -> None:
+        """Multiply the size field by `factor`."""
         self.size_factor *= factor
         self.stages.metric.scale_sizes(factor, self.h)
         self.evaluate_metric()
+
+    def sizes_over_mesh(self) -> np.ndarray:
+        """Return for each row the size of its cell on the device over that of its cell in the mesh of a solid, (n,).
+
+        Where the mesh has no such cell it is 1.
+        """
+        engine, scale = self.engine.alone(), self.domain.frame[1]
+        volumes = mesh_volumes(engine, self.domain, self.t, self.labels)
+        here = self.to_host(self.t.volumes, scale**3)
+        factors = np.empty(self.n)
+        factors[self._order] = np.where(volumes > 0, np.cbrt(here / np.where(volumes > 0, volumes, 1)), 1)
+        return factors.astype(self.engine.real)
 
     def insert_delete(
         self,

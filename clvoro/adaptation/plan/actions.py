@@ -6,6 +6,8 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
+import numpy as np
+
 from ..estimates import MOST_SURPLUS
 from ..motion import Displacement, Method
 from ..tuning import CLIMB_STRAIN, LEAST_PROGRESS, MAX_OSCILLATIONS, SAMPLING_GAIN
@@ -52,6 +54,43 @@ class Step:
         run.last = self.method
         run.steps += 1
         run.record()
+
+
+@dataclass(frozen=True)
+class StepOfMesh(Step):
+    """A step after which the cells of the mesh have their sizes where walls are curved, not those of the device.
+
+    A mesh is made before the step, and tells by how much the cells of both differ.
+    """
+
+    def apply(self, run: Run) -> None:
+        """Take the step towards sizes that make up for the difference, and record it."""
+        factors = run.state.sizes_over_mesh()
+        run.state.h.set(run.state.h.get() * factors)
+        super().apply(run)
+        if run.fixed_count is not None:
+            run.state.multiply_sizes(1 / math.exp(np.log(factors).mean()))
+
+
+@dataclass(frozen=True)
+class CountOfMesh:
+    """Insert and delete generators for the volume of the mesh where walls are curved, not that of the device's cells.
+
+    A mesh is made before.
+    """
+
+    def apply(self, run: Run) -> None:
+        """Insert and delete."""
+        mesh = run.state
+        if run.fixed_count is not None:
+            return
+        h = mesh.h.get()
+        mesh.h.set(h * mesh.sizes_over_mesh())
+        lack = round(mesh.missing_cells())
+        mesh.h.set(h)
+        if lack:
+            mesh.stages.clear_poisson()
+            mesh.insert_delete(0, mesh.total + lack, climb=False, most=max_cells(run))
 
 
 @dataclass(frozen=True)

@@ -81,7 +81,18 @@ from ..tuning import (
     STRIDE,
     TIGHT,
 )
-from .actions import Action, BalanceCounts, CorrectCount, InsertDelete, Refine, RepairCells, ResetMomentum, Step
+from .actions import (
+    Action,
+    BalanceCounts,
+    CorrectCount,
+    CountOfMesh,
+    InsertDelete,
+    Refine,
+    RepairCells,
+    ResetMomentum,
+    Step,
+    StepOfMesh,
+)
 from .efforts import EFFORTS_OF, Effort, choose_error_target
 
 COUPLE = WeightedMethod(cautious=True, tolerance=0.2, max_cycles=1)
@@ -108,6 +119,7 @@ def adaptive_schedule(
     near: bool = False,
     openings: int = 0,
     narrow_parts: bool = False,
+    curved_walls: bool = False,
 ) -> list[Action]:
     """Return the schedule of the methods "adaptive" and "exact", with `levels` coarser levels.
 
@@ -130,8 +142,16 @@ def adaptive_schedule(
         The domain, in 2D, may have parts that few cells join. The number of cells in each part is then balanced before
         each refinement, which multiplies what a part lacks, before polishing, and after each repair. The penalty of
         exact projections falls step by step (see `GRADUAL_PENALTIES`).
+    curved_walls : bool
+        Cells of the device and of the mesh differ at walls. If sizes are to be exact, a mesh is made to count its
+        cells, and another one before the last step.
     """
     schedule = _several_kinds(dim, effort, levels, exact, error_target, warm, near)
+    if curved_walls and exact:
+        last = schedule[-1]
+        assert isinstance(last, Step)
+        schedule[-1] = StepOfMesh(last.method)
+        schedule.insert(schedule.index(CorrectCount(POLISH_COUNT_3D)) + 1, CountOfMesh())
     projections = EXACT_STEPS if exact else 0
     if narrow_parts:
         polish = schedule.index(ResetMomentum()) - 1

@@ -149,6 +149,7 @@ def solid_diagram(
     sizes: np.ndarray,
     whole: Callable[[np.ndarray], Faces],
     tell: Callable[[str], object] = lambda _: None,
+    warns: bool = True,
 ) -> Diagram:
     """Return the mesh of a solid as a diagram, without short edges at walls.
 
@@ -166,6 +167,7 @@ def solid_diagram(
         the solid.
     tell : callable
         Called with the name of each part of the work.
+    warns : bool
 
     Raises
     ------
@@ -175,7 +177,8 @@ def solid_diagram(
     Warns
     -----
     MismatchWarning
-        If generators have no cell, cells are cut, leave out creases, or are concave: how many, and the first place.
+        With `warns`, if generators have no cell, cells are cut, leave out creases, or are concave: how many, and the
+        first place.
     """
     near = NearWalls.of(surface, points, sizes, whole(points))
     best = made = _Attempts(surface, near, np.full(len(near.sizes), EXACT, np.int8), None, tell)
@@ -208,7 +211,7 @@ def solid_diagram(
         ),
         (rejected, "cells at {} are concave, inverted, or as thin as the solid, and OpenFOAM does not accept them"),
     ):
-        if len(rows):
+        if warns and len(rows):
             place = format_point(rows[0]) + (" and elsewhere" if len(rows) > 1 else "")
             warn(f"{len(rows)} {text.format(place)}; use smaller sizes there", MismatchWarning)
     diagram = diagram_of(faces)

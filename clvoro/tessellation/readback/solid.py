@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import cast
 
 import numpy as np
 import pyopencl.array as cla
 
+from ...errors import InputError
 from ...finite_volumes.solid_walls.mesh import off_middle, outer_generators, solid_diagram
 from ...finite_volumes.solid_walls.wall_surface import WallSurface
 from ...geometry.box import Box
@@ -32,11 +34,22 @@ def read_generators(domain: Domain, t: Tessellation, labels: cla.Array) -> tuple
     return points, scale * np.cbrt(t.volumes.get()[: t.n][order].astype(float))
 
 
-def make_mesh(engine: Engine, domain: Solid, points: np.ndarray, sizes: np.ndarray) -> Diagram:
+def mesh_volumes(engine: Engine, domain: Domain, t: Tessellation, labels: cla.Array) -> np.ndarray:
+    """Return the volumes of the cells that the mesh of a solid has for the generators of `t`, (n,); 0 for none."""
+    points, sizes = read_generators(domain, t, labels)
+    try:
+        mesh = make_mesh(engine, cast("Solid", domain), points, sizes, warns=False)
+    except InputError:  # the end of the run tells
+        return np.zeros(t.n)
+    assert mesh.home is not None
+    return np.bincount(np.where(mesh.home < 0, -1 - mesh.home, mesh.home), mesh.volumes, t.n)
+
+
+def make_mesh(engine: Engine, domain: Solid, points: np.ndarray, sizes: np.ndarray, warns: bool = True) -> Diagram:
     """Return the mesh of a solid by its generators `points` (n, 3), for cells of the `sizes` (n,).
 
     Cells of a run are cut by planes of their own, and do not fit together. Those of the mesh are those of the Voronoi
-    diagram of the same generators, and end at the surface.
+    diagram of the same generators, and end at the surface. With `warns` what is wrong with it is told.
 
     Raises
     ------
@@ -56,4 +69,4 @@ def make_mesh(engine: Engine, domain: Solid, points: np.ndarray, sizes: np.ndarr
         stages.release()
         return replace(made.faces, diagram=None)
 
-    return solid_diagram(surface, points, sizes, whole, tell)
+    return solid_diagram(surface, points, sizes, whole, tell, warns)
