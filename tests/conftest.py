@@ -14,6 +14,7 @@ from hypothesis import settings
 
 from tests.grids import points_to_leave
 
+gc.disable()  # until all tests are collected
 os.environ.setdefault("MPLBACKEND", "Agg")
 # Dense references are small: more threads of a BLAS library only take the cores of other tests.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -142,7 +143,7 @@ if "CLVORO_TEST_DIVISION" in os.environ:
 @pytest.hookimpl(trylast=True)
 def pytest_collection_finish():
     """Let the garbage collector pass over modules and tests, which are a million objects and stay."""
-    gc.collect()
+    gc.enable()
     gc.freeze()
 
 
