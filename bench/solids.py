@@ -2,7 +2,7 @@
 
     python bench/solids.py [--only NAMES] [--runs NAMES] [--seeds N] [--resolutions NUMBERS] [--booleans N]
                            [--cells N] [--limit SECONDS] [--speed NUMBERS] [--domains NAMES] [--order SIZES]
-                           [--layers THICKNESS:COUNT:GROWTH,...] [--keep FOLDER]
+                           [--layers THICKNESS:COUNT:GROWTH,...] [--surfaces] [--keep FOLDER]
                            [--pictures FOLDER] [--device NAME] [--dtype float32] [--json]
 
 The solids are in `bench/_solid_shapes.py`; they need trimesh, manifold3d, shapely, networkx and, for the gyroid,
@@ -24,7 +24,9 @@ With `--layers` all patches of the solids have layers of prisms, such as `0.5:5:
 1.3. A row has the inner cells and the prisms, the mean thickness over the one given at the vertices of walls, the
 share of these with at least 0.9 of it, the mean first height where it is at least 0.9 of the one given, and the
 verdicts of `checkMesh` without and with its options.
-Pictures show each mesh cut open, with the patches in colors.
+With `--surfaces` the domains are those of `bench/_surface_scenes.py`, with surfaces inside. A row has the largest error
+of the volumes of regions that are known, over them, and the number of regions.
+Pictures show each mesh cut open, with the patches or the regions in colors.
 """
 
 from __future__ import annotations
@@ -45,6 +47,7 @@ import numpy as np
 from _common import CUBE, Report, counts, heading, make_adapter, names, parser
 from _openfoam import require
 from _solid_shapes import SHAPES, random_part, solid_of
+from _surface_scenes import SCENES
 from solver_ready import COLUMNS as PLANE_COLUMNS
 from solver_ready import figures_of
 
@@ -259,6 +262,39 @@ def reached(result: clvoro.Result, layers: clvoro.Layers) -> dict[str, float]:
     }
 
 
+SURFACE_COLUMNS = {
+    **{name: COLUMNS[name] for name in ("solid", "run", "cells", "s", "mean e", "non-orth. max, mean", "skewness")},
+    "regions": lambda r: r["regions"],
+    "their volumes": lambda r: f"{r['off']:.1e}",
+    "checkMesh": COLUMNS["checkMesh"],
+}
+
+
+def measure_surfaces(adapter: clvoro.Adapter, options: argparse.Namespace, report: Report) -> str:
+    """Add a row for each domain with surfaces inside, and return how many meshes `checkMesh` accepts."""
+    for name, run in product(names(options.only) or SCENES, names(options.runs)):
+        row: dict[str, Any] = {"solid": name, "run": run, "regions": 0, "off": float("nan")}
+        row |= dict.fromkeys(_EMPTY, float("nan"))
+        try:
+            domain, size, volumes = SCENES[name]()
+            with tempfile.TemporaryDirectory() as folder:
+                row |= measure(adapter, domain, size, Path(folder), **settings_of(run))
+            d = row["result"].diagram
+            found = dict(zip(d.region_names, np.bincount(d.cell_region, d.volumes), strict=True))
+            off = [abs(found[region] / volume - 1) for region, volume in volumes.items()]
+            row |= {"regions": len(found), "off": max(off, default=float("nan"))}
+            if options.pictures is not None:
+                options.pictures.mkdir(parents=True, exist_ok=True)
+                figure = row["result"].plot(d.cell_region, view="cutaway", title=name)
+                figure.savefig(options.pictures / f"{name}.png", dpi=150, bbox_inches="tight")
+        except ClvoroError as error:
+            row |= {"ok": False, "cells": 0, "complaints": f"{type(error).__name__}: {error}"}
+        row.pop("result", None)
+        report.add(row, f"{name}, {run}: {'OK' if row['ok'] else row['complaints']}")
+    good = sum(row["ok"] for row in report.records)
+    return f"{good} of {len(report.records)} meshes with surfaces inside pass checkMesh"
+
+
 SPEED_COLUMNS = {
     "domain": lambda r: r["domain"],
     "triangles": lambda r: r["triangles"],
@@ -369,10 +405,11 @@ def main() -> None:
     options_of.add_argument("--pictures", type=Path, metavar="FOLDER")
     options_of.add_argument("--order", default="", metavar="SIZES", help="errors of volume and area at these sizes")
     options_of.add_argument("--layers", default="", metavar="LAYERS", help="thickness / h:count:growth, as 0.5:5:1.3")
+    options_of.add_argument("--surfaces", action="store_true", help="domains with surfaces inside")
     options_of.add_argument("--domains", default="", metavar="NAMES", help=f"of --speed: {', '.join(DOMAINS)}")
     options = options_of.parse_args()
     for what, given, known in (
-        ("solid", () if options.booleans else names(options.only), SHAPES),
+        ("solid", () if options.booleans else names(options.only), SCENES if options.surfaces else SHAPES),
         ("resolution", names(options.resolutions), ("0", "1")),
         ("run", names(options.runs), RUNS),
         ("domain", names(options.domains), DOMAINS),
@@ -393,6 +430,9 @@ def main() -> None:
     if options.booleans:
         report = Report(options.json, BOOLEAN_COLUMNS)
         return report.finish(heading(adapter, measure_booleans(options, report)))
+    if options.surfaces:
+        report = Report(options.json, SURFACE_COLUMNS)
+        return report.finish(heading(adapter, measure_surfaces(adapter, options, report)))
     if options.layers:
         report = Report(options.json, LAYER_COLUMNS)
         return report.finish(heading(adapter, measure_layers(adapter, options, report)))

@@ -25,7 +25,7 @@ from ..geometry.domain import Domain
 from ..geometry.fixed_generators import FixedGenerators
 from ..geometry.gaps import NARROW
 from ..sizing import Sizing, as_field
-from ..sizing.distance import limit_beside_borders, limit_beside_layers
+from ..sizing.distance import before_layers, limit_beside_borders, limit_beside_layers
 from ..sizing.field import Field, on_domain
 from .diagnostics import check_precision, warn_of_mismatches, warn_of_narrow_parts
 from .estimates import SAMPLE, Extras, check_memory, check_prisms, estimate_memory, expected_images, expected_surplus
@@ -191,7 +191,8 @@ def prepare(
     around = _place_around(domain, free, fixed, rows, lambda x: scale * np.asarray(sizing(x)), target, tree is not None)
     if around is not None:
         fixed = np.concatenate([fixed, around.points])
-    setup = Setup(stages, domain, sizing, free, len(fixed) + len(rows), fixed, factor, own, around)
+    after = given_field if domain.extrudes_layers and options.layers else None
+    setup = Setup(stages, domain, sizing, free, len(fixed) + len(rows), fixed, factor, own, around, after)
     lattice = lattice_points(domain, target) if options.method in MOVING else None
     levels = _count_levels(setup, points, target, len(rows), options) if options.multilevel else 0
     if options.levels == "auto" and max_levels is not None:
@@ -277,13 +278,13 @@ def _check_together(domain: Domain, points: np.ndarray | None, fixed: np.ndarray
 def _place_layers(
     stages: Stages, domain: Domain, field: Field, options: Options, n_fixed: int
 ) -> tuple[np.ndarray, Domain, Field]:
-    """Return the generators of the layers, the domain without them, and the size field limited beside them."""
+    """Return the generators of the layers, the domain without them, and the size field that fits beside them."""
     layers, n_cells = options.layers, options.n_cells
     if not layers:
         return np.empty((0, domain.dim)), domain, field
     if domain.extrudes_layers:
         check_extruded(domain, layers)
-        return np.empty((0, domain.dim)), domain, field
+        return np.empty((0, domain.dim)), domain, before_layers(field, domain, layers)
     check_memory(stages.engine, count_rows(domain, layers), domain)
     check_gaps(domain, layers)
     rows, free = place_layers(domain, layers), free_domain(domain, layers)

@@ -531,7 +531,8 @@ class Run:
             # Cells may have been cut along creases: further parts come last. Generators in thin places may have none.
             own, home = home >= 0, np.where(home < 0, -1 - home, home)
             size, origin, fixed = size[home], np.where(own, origin[home], -1), fixed[home[own & (home < len(fixed))]]
-            size = np.where(diagram.layer > 0, np.cbrt(diagram.volumes), size)
+            if (after := mesh.setup.after_layers) is not None:
+                size = np.where(diagram.layer > 0, np.cbrt(diagram.volumes), mesh.size_factor * after(diagram.points))
             error, quality = self._measured_again(diagram, size)
         put_back(diagram, fixed)
         result = Result(

@@ -20,6 +20,7 @@ from ..opencl.device_array import buffer_of
 from ..opencl.engine import Engine
 from ..opencl.primitives import Summaries
 from ..sizing import Sizing
+from ..sizing.field import Field
 from ..solvers.linear_system import Solution
 from ..tessellation.bins import BinnedPoints
 from ..tessellation.decomposition import distribute, is_balanced
@@ -108,6 +109,8 @@ class Setup:
         Size of the cells over that of the size field, if a method keeps another number of cells than the field has.
     around : FixedGenerators or None
         Generators beside lines, or around corners or creases: the last of `points`.
+    after_layers : Field or None
+        Sizes of cells that layers of prisms have compressed, where `sizing` has those before.
     """
 
     stages: Stages
@@ -119,6 +122,7 @@ class Setup:
     factor: float = 1.0
     own_factor: float = 1.0
     around: FixedGenerators | None = None
+    after_layers: Field | None = None
 
     @property
     def first_sized(self) -> int:

@@ -19,6 +19,7 @@ from .layer_columns import Chain, count_columns, count_fan, find_chains, place_c
 from .polygon import Polygon
 
 if TYPE_CHECKING:
+    from .solid.solid import Solid
     from .surface import Surface
 
 _NEAR = 0.6  # of a cell: of two generators that are nearer to each other than this, one is dropped
@@ -30,6 +31,11 @@ _FILLED = 0.8  # share of a gap that layers may fill
 _FACING = -0.5  # cosine between the normals of two walls that face each other
 _MOST = 32767  # layers of prisms: their numbers have 16 bits
 _SAMPLE = 1024  # points on walls at which sizes are averaged
+_INSIDE, _LEAST_RATIO = 1 << 14, 0.7  # points of a solid that are counted, least ratio of compressed cells
+INNER_DEPTH, DEEPER = 2.0, 8.0
+"""How far from a wall with layers inner vertices move with it: this times h, and this times the thickness there."""
+OF_GAP = 0.15
+"""Share of the distance to the opposite wall that layers of prisms fill."""
 _OWN = 0.9  # of its distance from its wall: a generator that is nearer to another wall than this is dropped
 
 
@@ -393,6 +399,27 @@ def count_prisms(domain: Domain, layers: Sequence[Layers], size: Callable[[np.nd
         area = float(np.linalg.norm(np.cross(*np.diff(walls.corners, axis=1).swapaxes(0, 1)), axis=1).sum()) / 2
         total += layer.count * area * float((h**-2).mean())
     return total
+
+
+def compression(domain: Domain, layer: Layers, h: float) -> tuple[float, float]:
+    """Return how much the prisms of `layer` compress the cells of a solid beside them, and how deep.
+
+    That is the ratio of the sizes of these cells, with prisms and without, and the depth below the walls up to which
+    cells move; `h` is their size.
+    """
+    solid = cast("Solid", domain)
+    depth = INNER_DEPTH * h + DEEPER * layer.thickness
+    rows = np.flatnonzero(np.isin(solid.patch, solid.boundaries.select("Layers edges", layer.edges)))
+    rows = rows[:: -(-len(rows) // _SAMPLE)]
+    reach = np.full(len(rows), layer.thickness / OF_GAP)
+    middles = solid.surface.corners[rows].mean(axis=1)
+    room = solid.clearance(middles, -solid.normals[rows], reach, solid.patch[rows])
+    thickness = float(np.minimum(layer.thickness, OF_GAP * room).mean())
+    points = solid.lower + scipy.stats.qmc.Halton(3, scramble=False).random(_INSIDE) * solid.extent
+    away2 = cast("Surface", solid.boundary(layer.edges)).distance2(points[solid.contains(points)])
+    below = np.count_nonzero(away2 < depth**2)
+    share = np.count_nonzero(away2 < thickness**2) / max(below, 1)
+    return max((1 - share) ** (1 / 3), _LEAST_RATIO), depth
 
 
 def beyond_layers(domain: Domain, layers: Sequence[Layers], points: np.ndarray) -> np.ndarray:

@@ -13,7 +13,7 @@ import shapely
 
 from ..errors import InputError, InputTypeError
 from ..geometry import curves
-from ..geometry.boundary_layers import Layers, chosen_segments, outer_segments
+from ..geometry.boundary_layers import Layers, chosen_segments, compression, outer_segments, sample_walls
 from ..geometry.bvh import Tree
 from ..geometry.domain import Domain
 from ..geometry.lines.lines import Lines
@@ -21,7 +21,7 @@ from ..geometry.shapes import Circle, Edges, Polyline, Segment, shapes_of
 from ..geometry.surface import Surface
 from ..geometry.triangles import segment_distance2
 from .arguments import check_positive, check_slope
-from .field import Field, as_field, minimum
+from .field import Field, as_field, maximum, minimum
 
 if TYPE_CHECKING:
     from .codegen import CodeWriter
@@ -266,6 +266,9 @@ def _item_boxes(begin: np.ndarray, end: np.ndarray, radius: np.ndarray) -> tuple
     return np.minimum(begin, end) - wide, np.maximum(begin, end) + wide
 
 
+_WALLS, _COMPRESSED, _FADING = 1024, 0.995, 0.4
+"""Points on walls whose sizes are averaged; ratio of sizes from which on prisms compress cells; over which share of the
+depth the ratio changes to 1."""
 _GROWTH = 1.2
 """Growth of sizes beyond layers of constant height."""
 _CLASS = 1.4
@@ -282,6 +285,20 @@ def limit_beside_layers(size: object, domain: Domain, layers: Sequence[Layers]) 
             segments = chosen_segments(domain, layer)
             widths = np.full(len(segments), layer.width)
         field = _limited(field, segments, widths, layer.width, slope)
+    return field
+
+
+def before_layers(field: Field, domain: Domain, layers: Sequence[Layers]) -> Field:
+    """Return the sizes of cells of a solid that have those of `field` once layers of prisms have compressed them."""
+    for layer in layers:
+        walls, h = sample_walls(domain, layer, field, _WALLS)
+        ratio, depth = compression(domain, layer, float(h.mean()))
+        if ratio < _COMPRESSED:
+            # The ratio up to about this depth, and 1 beyond.
+            slope = (1 - ratio) / (_FADING * depth)
+            begin = ratio - (1 - 0.5 * _FADING) * depth * slope
+            ramp = Distance(walls, h_min=begin, slope=slope, h_max=1.0)
+            field = field / maximum(ramp, ratio)
     return field
 
 

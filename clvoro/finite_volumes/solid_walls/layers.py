@@ -12,7 +12,7 @@ import scipy
 
 from ...arguments import format_point, warn
 from ...errors import MismatchWarning
-from ...geometry.boundary_layers import Layers
+from ...geometry.boundary_layers import DEEPER, INNER_DEPTH, OF_GAP, Layers
 from ...mesh.connectivity import distinct, following, rows_with, take_rows
 from ...mesh.diagram import Diagram
 from ...mesh.faces import Faces
@@ -30,12 +30,8 @@ _LONGEST = 2.2
 """Longest way of a vertex over the thickness: three walls at right angles need 1.73."""
 _SAME = 0.15
 """Patches at a vertex count as parallel if the tangent of half the angle between their normals is less than this."""
-_OF_GAP = 0.15
-"""Share of the distance to the opposite wall that layers fill."""
 _SLOPE = 0.6
 """Largest change of the thickness along a wall, over the distance."""
-_DEPTH, _DEEPER = 2.0, 8.0
-"""How far from a wall that moves inner vertices move with it: this times h, and this times the way of the wall."""
 _SWEEPS = 100
 """Steps that make the ways of vertices along walls smooth."""
 _RESIDUAL, _MOST = 1e-3, 60
@@ -248,7 +244,7 @@ class _LayeredWalls:
     @property
     def _reach(self) -> np.ndarray:
         """How far from each vertex that moves others follow it, (u,)."""
-        return _DEPTH * self.sizes + _DEEPER * np.linalg.norm(self.way, axis=1)
+        return INNER_DEPTH * self.sizes + DEEPER * np.linalg.norm(self.way, axis=1)
 
     @cached_property
     def _room(self) -> np.ndarray:
@@ -267,7 +263,7 @@ class _LayeredWalls:
         """Return the shares (u,) of the full way that vertices move: less in gaps, and near places without layers."""
         length = np.linalg.norm(self.way, axis=1)
         share, rows = (length > 0).astype(float), np.flatnonzero(length)
-        share[rows] = np.minimum(1, _OF_GAP * self._room[rows] / length[rows])
+        share[rows] = np.minimum(1, OF_GAP * self._room[rows] / length[rows])
         return self.smooth(share)
 
     def smooth(self, share: np.ndarray) -> np.ndarray:

@@ -105,9 +105,9 @@ class Surfaces(Borders):
         }
 
     def check_within(self, domain: Domain) -> None:
-        """Raise an `InputError` if surfaces are outside of a domain, reach its periodic sides, or cross each other there.
+        """Raise an `InputError` if surfaces are outside of a domain, reach periodic sides, or cross each other in it.
 
-        Where they cross on the walls or beyond them does not matter, such as caps of nested pipes that leave the domain.
+        They may cross on its walls or beyond them, as the ends of nested pipes that leave it do.
         """
         corners = self.surface.corners
         low, high, extent = corners.min(axis=(0, 1)), corners.max(axis=(0, 1)), float(domain.extent.max())
