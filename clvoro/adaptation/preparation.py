@@ -191,7 +191,7 @@ def prepare(
     around = _place_around(domain, free, fixed, rows, lambda x: scale * np.asarray(sizing(x)), target, tree is not None)
     if around is not None:
         fixed = np.concatenate([fixed, around.points])
-    after = given_field if domain.extrudes_layers and options.layers else None
+    after = given_field if options.layers and not len(rows) else None
     setup = Setup(stages, domain, sizing, free, len(fixed) + len(rows), fixed, factor, own, around, after)
     lattice = lattice_points(domain, target) if options.method in MOVING else None
     levels = _count_levels(setup, points, target, len(rows), options) if options.multilevel else 0

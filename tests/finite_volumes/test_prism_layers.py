@@ -128,7 +128,7 @@ def test_curved_walls_keep_the_thickness(adapter):
     # Facets of the surface and normals over polygons change the thickness by their squared turn.
     assert np.abs(away / 0.075 - 1).max() < 0.05
     assert mesh.check("openfoam")
-    # Cells beside them have the sizes asked for, though they have made room: the prisms take 13 % of the volume.
+    # Cells beside them have the sizes of the field, though they have made room: the prisms take 13 % of the volume.
     assert mesh.volumes[mesh.layer == 0].mean() == pytest.approx(0.35**3, rel=0.02)
     assert np.abs(mesh.size_error[mesh.layer == 0]).mean() < 0.03
 
