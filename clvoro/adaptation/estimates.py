@@ -87,11 +87,12 @@ def estimate_memory(
     *,
     run: bool = True,
     power: bool = False,
+    exact: bool = False,
 ) -> float:
     """Return the largest device memory of a run of `n` cells, or of reading its diagram, in bytes.
 
     Without `run`, return that of `Adapter.diagram`. With `power`, the run ends with a power diagram, or the diagram is
-    one.
+    one. With `exact`, meshes are made during the run if walls are curved.
     """
     extras = Extras() if extras is None else extras
     traits = engine.traits
@@ -116,7 +117,8 @@ def estimate_memory(
         walls = domain.boundary_measure / (domain.measure / max(n, 1.0)) ** (2 / 3)
         cells += CELLS_PER_WALL_CELL * min(walls, n)
         space += domain.wall_triangles.device_bytes(engine.real)
-    reals, integers = SIZES[kind][work]
+    works = [work, "diagram"] if exact and kind == "curved" else [work]
+    reals, integers = (sum(SIZES[kind][w][k] for w in works) for k in (0, 1))
     return float(cells) * (reals * engine.real.itemsize + integers * 4) + space + FIXED + extras.field_bytes
 
 
@@ -128,6 +130,7 @@ def check_memory(
     *,
     run: bool = True,
     power: bool = False,
+    exact: bool = False,
 ) -> float:
     """Check that the device has memory for `n` cells, and return the bytes needed (see `estimate_memory`).
 
@@ -139,7 +142,7 @@ def check_memory(
     """
     device = engine.queue.device
     name, available = device.name.strip(), available_memory(device)
-    needed = estimate_memory(engine, n, domain, extras, run=run, power=power)
+    needed = estimate_memory(engine, n, domain, extras, run=run, power=power, exact=exact)
     if n > MAX_CELLS:
         raise MemoryLimitError(
             f"the run has {n:.3g} cells, expected at most {MAX_CELLS:.3g}, the limit of 32-bit indices (they need "

@@ -28,7 +28,7 @@ from ..sizing import Sizing, as_field
 from ..sizing.distance import before_layers, limit_beside_borders, limit_beside_layers
 from ..sizing.field import Field, on_domain
 from .diagnostics import check_precision, warn_of_mismatches, warn_of_narrow_parts
-from .estimates import SAMPLE, Extras, check_memory, check_prisms, estimate_memory, expected_images, expected_surplus
+from .estimates import SAMPLE, Extras, check_memory, check_prisms, expected_images, expected_surplus
 from .fixed_points import check_beside_borders, check_room, place_in_corners
 from .methods import MOVING, Relaxation, make_method
 from .moving.lattice import lattice_points
@@ -375,11 +375,11 @@ def _estimate_memory(
     if any(domain.periodic) and tree is not None:
         images = expected_images(domain, sizing, most * tree.integral / required, tree)
     field_bytes = sizing.device_bytes + sizing.bytes_for(most)
-    if domain.curved_walls and options.method == "exact":  # meshes are made during the run
-        field_bytes += estimate_memory(engine, most, domain, run=False)
     if tree is not None:
         boundary = domain.along_cutting_edges(lambda p: 1 / ((required / most) ** 0.5 * sizing(p)), SAMPLE)
-    needed = check_memory(engine, most, domain, Extras(images, surplus, field_bytes, boundary), power=power)
+    exact = options.method == "exact"
+    extras = Extras(images, surplus, field_bytes, boundary)
+    needed = check_memory(engine, most, domain, extras, power=power, exact=exact)
     # For few cells, the preparation may have taken more than the run.
     return max(needed, float(sizing.peak_bytes))
 
@@ -505,7 +505,6 @@ def plan(prepared: Prepared, near: bool) -> Plan:
         near=near,
         openings=OPENINGS if domain.for_c_grids else 0,
         narrow_parts=domain.cuts_cells,
-        curved_walls=domain.curved_walls,
     )
     if options.method == "transport":
         schedule += [Prescribe(), *[Prescribe(move=True)] * MOVES]

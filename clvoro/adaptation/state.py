@@ -27,7 +27,6 @@ from ..tessellation.decomposition import distribute, is_balanced
 from ..tessellation.device_diagram import Tessellation
 from ..tessellation.readback.diagram import order_of
 from ..tessellation.readback.parts import fetch_part
-from ..tessellation.readback.solid import mesh_volumes
 from ..tessellation.tessellator import Tessellator
 from .density import CellWeights
 from .fixed_points import clear_balls, take_places
@@ -531,14 +530,15 @@ class MeshState:
         self.stages.metric.scale_sizes(factor, self.h)
         self.evaluate_metric()
 
-    def sizes_over_mesh(self) -> np.ndarray:
-        """Return for each row the size of its cell on the device over that of its cell in the mesh of a solid, (n,).
+    def sizes_over_mesh(self) -> np.ndarray | None:
+        """Return for each row the size of its cell on the device over that of its cell in the mesh, (n,).
 
-        Where the mesh has no such cell it is 1.
+        Where the mesh has no such cell it is 1. None if all walls are straight, and cells are those of the mesh.
         """
-        engine, scale = self.engine.alone(), self.domain.frame[1]
-        volumes = mesh_volumes(engine, self.domain, self.t, self.labels)
-        here = self.to_host(self.t.volumes, scale**3)
+        volumes = self.tessellator.steps.volumes_of_mesh(self.t, self.labels)
+        if volumes is None:
+            return None
+        here = self.to_host(self.t.volumes, self.domain.frame[1] ** 3)
         factors = np.empty(self.n)
         factors[self._order] = np.where(volumes > 0, np.cbrt(here / np.where(volumes > 0, volumes, 1)), 1)
         return factors.astype(self.engine.real)

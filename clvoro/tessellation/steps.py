@@ -125,6 +125,9 @@ class DomainSteps:
         """Return the latest diagram `t` with the measures of its cells in the domain, if a run measures others."""
         return t
 
+    def volumes_of_mesh(self, t: Tessellation, labels: cla.Array) -> np.ndarray | None:
+        """Return the volumes of cells in the mesh by `labels`, (n,), 0 for none; None if they are those of `t`."""
+
     def warn_of_leaks(self, t: Tessellation) -> None:
         """Warn of cells of the final diagram `t` that the walls do not bound."""
 
@@ -163,6 +166,12 @@ class SolidWalls(DomainSteps):
         if previous is None:
             self.walls.guess(binned, part.n_own)
         self.walls.find(part.points)
+
+    def volumes_of_mesh(self, t: Tessellation, labels: cla.Array) -> np.ndarray:
+        """Return the volumes of cells in the mesh that ends at the surface."""
+        from .readback.solid import mesh_volumes
+
+        return mesh_volumes(self.stages.engine.alone(), self.domain, t, labels)
 
     def warn_of_leaks(self, t: Tessellation) -> None:
         """Warn of cells that reach the box around the solid, and of generators outside of their nearest patch."""

@@ -66,9 +66,10 @@ class StepOfMesh(Step):
     def apply(self, run: Run) -> None:
         """Take the step towards sizes that make up for the difference, and record it."""
         factors = run.state.sizes_over_mesh()
-        run.state.h.set(run.state.h.get() * factors)
+        if factors is not None:
+            run.state.h.set(run.state.h.get() * factors)
         super().apply(run)
-        if run.fixed_count is not None:
+        if factors is not None and run.fixed_count is not None:
             run.state.multiply_sizes(1 / math.exp(np.log(factors).mean()))
 
 
@@ -82,10 +83,11 @@ class CountOfMesh:
     def apply(self, run: Run) -> None:
         """Insert and delete."""
         mesh = run.state
-        if run.fixed_count is not None:
+        factors = mesh.sizes_over_mesh() if run.fixed_count is None else None
+        if factors is None:
             return
         h = mesh.h.get()
-        mesh.h.set(h * mesh.sizes_over_mesh())
+        mesh.h.set(h * factors)
         lack = round(mesh.missing_cells())
         mesh.h.set(h)
         if lack:

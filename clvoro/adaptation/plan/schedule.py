@@ -119,7 +119,6 @@ def adaptive_schedule(
     near: bool = False,
     openings: int = 0,
     narrow_parts: bool = False,
-    curved_walls: bool = False,
 ) -> list[Action]:
     """Return the schedule of the methods "adaptive" and "exact", with `levels` coarser levels.
 
@@ -142,16 +141,8 @@ def adaptive_schedule(
         The domain, in 2D, may have parts that few cells join. The number of cells in each part is then balanced before
         each refinement, which multiplies what a part lacks, before polishing, and after each repair. The penalty of
         exact projections falls step by step (see `GRADUAL_PENALTIES`).
-    curved_walls : bool
-        Cells of the device and of the mesh differ at walls. If sizes are to be exact, a mesh is made to count its
-        cells, and another one before the last step.
     """
     schedule = _several_kinds(dim, effort, levels, exact, error_target, warm, near)
-    if curved_walls and exact:
-        last = schedule[-1]
-        assert isinstance(last, Step)
-        schedule[-1] = StepOfMesh(last.method)
-        schedule.insert(schedule.index(CorrectCount(POLISH_COUNT_3D)) + 1, CountOfMesh())
     projections = EXACT_STEPS if exact else 0
     if narrow_parts:
         polish = schedule.index(ResetMomentum()) - 1
@@ -376,6 +367,8 @@ def _finish_3d(effort: Effort, exact: bool, error_target: float, penalty: float)
     yield from [Step(polish)] * (effort.polish // 2)
     # Where h is steep, cells of other shapes have their generators at other places, with other sizes.
     yield CorrectCount(POLISH_COUNT_3D)
+    if exact:
+        yield CountOfMesh()
     yield from [Step(polish)] * (effort.polish - 1 - effort.polish // 2)
     yield Step(settle)
     if exact:
@@ -387,8 +380,9 @@ def _finish_3d(effort: Effort, exact: bool, error_target: float, penalty: float)
             gradient_from_field=True,
             correct_mean=True,
         )
-        for tolerance in NEWTON_TOLERANCES_3D:
-            yield Step(replace(newton, tolerance=tolerance))
+        *first, last = (replace(newton, tolerance=tolerance) for tolerance in NEWTON_TOLERANCES_3D)
+        yield from [Step(method) for method in first]
+        yield StepOfMesh(last)
 
 
 def work_of(schedule: list[Action], levels: int, dim: int, cells: float) -> list[float]:
