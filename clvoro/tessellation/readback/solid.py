@@ -49,7 +49,7 @@ def make_mesh(engine: Engine, domain: Solid, points: np.ndarray, sizes: np.ndarr
     """Return the mesh of a solid by its generators `points` (n, 3), for cells of the `sizes` (n,).
 
     Cells of a run are cut by planes of their own, and do not fit together. Those of the mesh are those of the Voronoi
-    diagram of the same generators, and end at the surface. With `warns` what is wrong with it is told.
+    diagram of the same generators, and end at the surface. With `warns` it warns of what is wrong.
 
     Raises
     ------
