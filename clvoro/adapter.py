@@ -417,7 +417,7 @@ class Adapter:
             the paper. From an array, "adaptive" and "exact" only correct and polish a mesh that nearly has the sizes
             already (mean |e| up to 0.15, count off by 2 % at most, cells as good as after a run with this effort), as
             after the size field has moved by a few cells. From any other array they run all levels; where mean |e| is
-            above 1 a random start replaces it, unless `options` has levels.
+            above 0.6 a random start replaces it, unless `options` has levels.
         method : str
             "adaptive" goes from coarse to fine, inserts and deletes generators, and ends with good cells of the right
             size. "exact" gives every cell its target size, to about 1e-4; "transport" to 1e-10 (float32: 1e-3), in a

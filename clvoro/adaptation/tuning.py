@@ -8,8 +8,8 @@ Lengths are over h, the target size, unless they say otherwise. e is the error o
 
 NEAR_ERROR, NEAR_COUNT = 0.15, 0.02
 """Mean |e|, and share of missing cells, up to which a given mesh is only corrected."""
-USELESS_ERROR = 1.0
-"""Mean |e| above which a given mesh is replaced by a new one (`bench/restart.py --moves 1 --by 100`)."""
+USELESS_ERROR = 0.6
+"""Mean |e| above which a given mesh is replaced by a new one; that of random points is below it."""
 DEFICIT_3D = 0.36
 """1 - mean Q in 3D up to which a given mesh counts as smoothed."""
 WALL_DEFICIT = 0.49

@@ -18,8 +18,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from ..adaptation.options import EffortName, Start
-from ..adaptation.tuning import NEAR_ERROR
+from ..adaptation.options import EffortName
 from ..adapter import Adapter
 from ..arguments import check_integer, check_number, warn
 from ..errors import InputError, InputTypeError, LostFieldsWarning, MismatchWarning
@@ -396,7 +395,7 @@ class _Loop:
         size = self._sizes_in_window(fields, old, latest)
         layers = tuple(_layers_of(note["layers"])) if self.layers is None else self.layers
         domain = old.diagram.domain
-        points = _generators(old.diagram, size)
+        points = old.diagram.points
         made = self.adapter.run(domain, size, self.effort, points=points, n_cells=self.n_cells, layers=layers)
         mesh_seconds = time.perf_counter() - start
         make_folder(case.own)
@@ -531,16 +530,6 @@ class _Loop:
             top, left = k // columns * high, k % columns * wide
             page[top : top + part.shape[0], left : left + part.shape[1]] = part
         image.imsave(own / "cycles.png", page)
-
-
-def _generators(old: Diagram, size: Estimate) -> np.ndarray | Start:
-    """Return the generators of a mesh if they only need to be corrected for the sizes, else "density", for a new mesh.
-
-    A run replaces given generators only where the mean |e| is above 1. Below that, the mesh that it makes from them
-    takes as long as a new one, and its cells may be less regular (`bench/restart.py --moves 1 --by 30 --cold`).
-    """
-    error = old.volumes ** (1 / old.domain.cell_dim) / size(old.centroids) - 1
-    return old.points if np.abs(error).mean() <= NEAR_ERROR else "density"
 
 
 def _check_values(fields: Sequence[FoamField], foam: FoamMesh) -> None:

@@ -18,7 +18,6 @@ from clvoro.foam import case as cases
 from clvoro.foam import fluxes
 from clvoro.foam.case import FoamCase
 from clvoro.foam.fluxes import MOST_DIVERGENCE, divergence
-from clvoro.foam.loop import _generators
 from clvoro.foam.mesh import FoamMesh, polygon_of_edges
 from clvoro.foam.transfer import _along_line
 from clvoro.io import foam_read
@@ -319,13 +318,6 @@ def test_a_window_in_time_counts(case):
 
 
 LAYERS = clvoro.Layers(0.02, 2, 1.2, spacing=0.08, edges="walls")
-
-
-def test_generators_are_kept_for_sizes_like_theirs(template):
-    mesh = clvoro.load(template / "constant" / "polyMesh" / "clvoro.npz")
-    h = np.sqrt(mesh.volumes)
-    assert _generators(mesh, sizing.Estimate(mesh, 1.1 * h, h)) is mesh.points
-    assert _generators(mesh, sizing.Estimate(mesh, h * (0.5 + mesh.centroids[:, 0]), h)) == "density"
 
 
 def test_exchanges_without_the_system_call(case, monkeypatch):
