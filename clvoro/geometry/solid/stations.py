@@ -10,7 +10,7 @@ there complete the corner.
 
 Generators have no room if a wall or others are near, or if others are in a ball. They come nearer to their crease then,
 step by step; in the end those of the shortest chains are left out. The cells of those that are nearer are smaller than
-others, and their target size is the size that they have.
+others, and their target size is the size that they have. So it is around creases with a radius of about two cells.
 """
 
 from __future__ import annotations
@@ -40,6 +40,7 @@ _SHRINKAGE, _LEAST = 0.8, 0.2  # steps in which generators without room come nea
 _SECTORS = math.radians(120), math.radians(60)  # widest and narrowest sectors of generators
 _WIDEST = math.radians(150)  # sectors where there is no room for more generators
 _SHORT = 0.8  # over the radii at its ends: the radii are the same at both ends of shorter chords
+_CURVED = math.radians(25)  # mean angle between the chords of a narrow curve
 _SAMPLES = 8  # of 1 / h per step, at least
 _FEWEST = 64  # samples per chain, at least
 _MOST = 1 << 16
@@ -60,18 +61,18 @@ class Stations(FixedGenerators):
         The size h of their cells.
     chain : (n,) int
         The chain that each one belongs to; -1 for those that complete a corner.
-    n_small : int
-        How many have no room for cells of the size h: the last ones.
+    n_own : int
+        How many have cells whose target size is the size that they have: the last ones.
     """
 
     size: np.ndarray
     chain: np.ndarray
-    n_small: int
+    n_own: int
 
     @property
     def n_sized(self) -> int:
         """Number of the last generators whose cells have as target size the size that they have."""
-        return self.n_small
+        return self.n_own
 
 
 @dataclass(frozen=True)
@@ -201,6 +202,11 @@ class ChainOfChords:
         self.radii = 0.5 * (np.append(before, radii) + np.append(radii, after))
 
     @property
+    def sized(self) -> np.ndarray:
+        """Whether the target size of the cells around each chord is the size that they have, (n,) bool."""
+        return self.h < self.full
+
+    @property
     def count(self) -> np.ndarray:
         """Number of generators around each chord, (n,) int."""
         return np.array([len(turns) for turns in self.turns], int)
@@ -252,6 +258,12 @@ class _Crease(ChainOfChords):
         half = 0.5 * self.angle / np.maximum(self.sectors, 2)
         # A cell is a kite with the area h^2 whose tip is on the crease; its generator is at the centroid.
         self.set_radii(self.h / np.sqrt(np.tan(half)) * (np.cos(half) + 1 / np.cos(half)) / 3)
+
+    @property
+    def sized(self) -> np.ndarray:
+        """See `ChainOfChords`. On the inner side of a narrow curve there is less room along the crease than outside."""
+        turn = np.einsum("ij,ij->i", self.ways[1:], self.ways[:-1])
+        return super().sized | bool(len(turn) and np.arccos(np.clip(turn, -1, 1)).mean() > _CURVED)
 
     def shrink(self, crowded: np.ndarray) -> bool:
         """Move the generators at `crowded` chords (n,) bool nearer to these; return whether that has been possible.
@@ -328,7 +340,7 @@ class AroundCreases:
     def __init__(self, depth: Callable[[np.ndarray], np.ndarray]) -> None:
         self.depth = depth
         self.points, self.sizes, self.chains = np.zeros((0, 3)), np.zeros(0), np.zeros(0, np.int64)
-        self.small = np.zeros(0, bool)  # whether there is less room than for cells of the size h
+        self.sized = np.zeros(0, bool)  # whether the target size of a cell is the size that it has
         self.spots = np.zeros((0, 3))  # the middle of each chord
         self.chords: list[list[int]] = []  # of each generator
         self.balls: list[list[int]] = []  # of each generator
@@ -344,7 +356,7 @@ class AroundCreases:
         self.radii += chain.radii.tolist()
         self.points = np.vstack([self.points, *(chain.around(i) for i in range(len(chain.h)))])
         self.sizes = np.append(self.sizes, chain.h[chord])
-        self.small = np.append(self.small, (chain.h < chain.full)[chord])
+        self.sized = np.append(self.sized, chain.sized[chord])
         self.chains = np.append(self.chains, np.full(len(chord), chain.number))
         self.chords += [[len(self.spots) + i] for i in chord.tolist()]
         self.first_chord[chain.number] = len(self.spots)
@@ -355,7 +367,7 @@ class AroundCreases:
         """Keep some of the generators: those of these rows, or where (n,) bool is true."""
         rows = np.arange(len(self.points))[kept].tolist()
         self.points, self.sizes, self.chains = self.points[kept], self.sizes[kept], self.chains[kept]
-        self.small = self.small[kept]
+        self.sized = self.sized[kept]
         self.balls, self.chords = ([x[k] for k in rows] for x in (self.balls, self.chords))
 
     def join(self, within: float = _EXACT) -> None:
@@ -496,7 +508,7 @@ class AroundCreases:
                     break
             self.points = np.vstack([self.points, *added])
             self.sizes = np.append(self.sizes, np.full(len(added), h))
-            self.small = np.append(self.small, np.full(len(added), self.small[near].any()))
+            self.sized = np.append(self.sized, np.full(len(added), self.sized[near].any()))
             self.chains = np.append(self.chains, np.full(len(added), -1))
             self.balls += [[] for _ in added]
             self.chords += [[] for _ in added]
@@ -508,7 +520,7 @@ class AroundCreases:
 
     def stations(self) -> Stations:
         """Return what has been placed."""
-        self.keep(np.argsort(self.small, kind="stable"))
+        self.keep(np.argsort(self.sized, kind="stable"))
         used, balls = np.unique([ball for balls in self.balls for ball in balls], return_inverse=True)
         return Stations(
             self.points,
@@ -519,7 +531,7 @@ class AroundCreases:
             self.lost,
             self.sizes,
             self.chains,
-            int(self.small.sum()),
+            int(self.sized.sum()),
         )
 
 

@@ -84,10 +84,16 @@ def test_generators_come_nearer_to_creases_where_there_is_little_room():
     solid = Solid(parts.surface.vertices * [0.5, 0.25, 1.0], parts.surface.triangles)
     stations = solid.stations(lambda x: np.full(len(x), h))
     assert len(stations.left_out) == 0
-    assert 0 < stations.n_small < len(stations)
-    assert stations.size[: -stations.n_small] == pytest.approx(h, rel=0.3)
-    assert (stations.size[-stations.n_small :] < 0.81 * h).all()
+    assert 0 < stations.n_sized < len(stations)
+    assert stations.size[: -stations.n_sized] == pytest.approx(h, rel=0.3)
+    assert (stations.size[-stations.n_sized :] < 0.81 * h).all()
     assert (KDTree(stations.points).query(stations.centers)[0] > 0.9 * stations.radii).all()
+
+
+def test_cells_around_narrow_curves_have_their_own_sizes():
+    for h, share in ((0.2, 0), (0.25, 1)):
+        stations = STEPPED.stations(lambda x, h=h: np.full(len(x), h))
+        assert stations.n_sized == share * len(stations)
 
 
 @pytest.mark.parametrize(("length", "count"), [(0.15, 0), (0.2, 3), (0.5, 3)])
