@@ -96,6 +96,15 @@ class DeviceArray(cla.Array):
             return make_array(queue, (), self.dtype, buffer, offset)
         return super().__getitem__(index)
 
+    def reshape(self, *shape: int, **kwargs: Any) -> cla.Array:
+        """Return a view of another shape; fast for lengths that are given one by one."""
+        if kwargs or not self.size or not all(type(n) is int for n in shape) or math.prod(shape) != self.size:
+            return super().reshape(*shape, **kwargs)
+        queue, buffer = self._place()
+        view = make_array(queue, shape, self.dtype, buffer, self.offset)
+        view.mark = self.mark
+        return view
+
     def get(self, queue: cl.CommandQueue | None = None, ary: np.ndarray | None = None) -> np.ndarray:
         """Fetch the content."""
         if queue is not None or ary is not None or not self.size:

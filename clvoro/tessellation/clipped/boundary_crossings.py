@@ -10,6 +10,7 @@ import pyopencl.array as cla
 from ...errors import InputError
 from ...geometry.polygon import Polygon
 from ...geometry.rings import OrientedRings
+from ...opencl.device_array import read_number
 from ...opencl.engine import Engine
 from ...opencl.primitives import NamedArrays, Scan
 from ..device_diagram import Tessellation
@@ -169,7 +170,7 @@ class Boundary:
         engine.run_each(k.find_firsts, count, cells, slots)
         engine.run_each(k.flag_firsts, count, cells, slots, ranks)
         self._scan.exclusive(ranks, ranks, count)
-        touched_count = int(ranks[count].get())
+        touched_count = int(read_number(ranks, count))
         touched = room("touched", size=touched_count, dtype=np.int32)
         starts = room("starts", size=touched_count + 1, dtype=np.int32)
         listed = room("listed", size=count, dtype=np.int32)

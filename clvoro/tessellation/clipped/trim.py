@@ -8,6 +8,7 @@ import numpy as np
 import pyopencl.array as cla
 
 from ...geometry.polygon import Polygon
+from ...opencl.device_array import read_number
 from ...opencl.engine import Engine
 from ...opencl.primitives import NamedArrays, Scan
 from ..device_diagram import Tessellation
@@ -157,7 +158,7 @@ class Trim:
             convex.neighbors,
             self._flags,
         )
-        self._demand(int(self._flags.get()[0]))
+        self._demand(int(read_number(self._flags, 0)))
         marks = room.zeros("marks", size=n, dtype=np.int32)
         found = _Pieces(segments, count, pieces, roots, marks, (pieces, 0))
         if flags & ORPHANS:
@@ -185,7 +186,7 @@ class Trim:
         engine.run_each(k.settle_pieces, u, *cells, roots, ranks, found.marks)
         self._scan.exclusive(ranks, ranks, places)
         engine.run_each(k.list_orphans, places, ranks, orphans)
-        return orphans, int(ranks[places].get())
+        return orphans, int(read_number(ranks, places))
 
     def _write(
         self, points: cla.Array, convex: Tessellation, chords: Chords, found: _Pieces, straight: bool
@@ -205,10 +206,10 @@ class Trim:
         return Tessellation(
             n=n,
             points=points,
-            starts=starts[: n + 1],
-            neighbors=neighbors[:m],
-            face_measures=measures[:m],
-            face_centroids=centroids[: 2 * m].reshape(m, 2),
+            starts=starts,
+            neighbors=neighbors,
+            face_measures=measures,
+            face_centroids=centroids.reshape(m, 2),
             volumes=convex.volumes[:n],
             offsets=convex.offsets[:n],
             covariances=convex.covariances[:n],
