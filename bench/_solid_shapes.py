@@ -126,6 +126,20 @@ SHAPES: dict[str, tuple[Callable[[], trimesh.Trimesh], tuple[float, float]]] = {
 }
 
 
+def bent_pipe() -> trimesh.Trimesh:
+    """Return a pipe with a bend of 90 degrees between straight parts."""
+    import shapely
+
+    turn = np.linspace(0, math.pi / 2, 33)
+    path = np.column_stack([np.cos(turn), np.sin(turn), 0 * turn])
+    path = np.vstack([(1, -1, 0), path, (-1, 1, 0)])
+    return creation.sweep_polygon(shapely.Point(0, 0).buffer(0.25, quad_segs=12), path)
+
+
+LAYERED = {**SHAPES, "ball": (lambda: creation.icosphere(4), (0.2, 0.12)), "bent pipe": (bent_pipe, (0.08, 0.05))}
+"""The same and others, for layers along their walls."""
+
+
 def random_part(seed: int) -> trimesh.Trimesh:
     """Return booleans of two to five random boxes, balls and cylinders that is one piece."""
     rng = np.random.default_rng(seed)

@@ -46,7 +46,7 @@ from typing import Any
 import numpy as np
 from _common import CUBE, Report, counts, heading, make_adapter, names, parser
 from _openfoam import require
-from _solid_shapes import SHAPES, random_part, solid_of
+from _solid_shapes import LAYERED, SHAPES, random_part, solid_of
 from _surface_scenes import SCENES
 from solver_ready import COLUMNS as PLANE_COLUMNS
 from solver_ready import figures_of
@@ -200,6 +200,7 @@ LAYER_COLUMNS = {
     "cells": lambda r: f"{r['cells'] - r['prisms']} + {r['prisms']}",
     "s": PLANE_COLUMNS["s"],
     "mean e": COLUMNS["mean e"],
+    "of inner cells": lambda r: f"{r['inner']:.4f}",
     "thickness": lambda r: f"{r['thickness']:.3f}",
     "full": lambda r: f"{100 * r['full']:.1f} %",
     "first height": lambda r: f"{r['first']:.3f}",
@@ -214,14 +215,19 @@ _FULL = 0.9
 
 def measure_layers(adapter: clvoro.Adapter, options: argparse.Namespace, report: Report) -> str:
     """Add a row for each solid with layers on all patches, and return how many meshes `checkMesh` accepts."""
-    for name, level, given in product(names(options.only) or SHAPES, names(options.resolutions), names(options.layers)):
-        make, sizes = SHAPES[name]
+    for name, level, given in product(
+        names(options.only) or LAYERED, names(options.resolutions), names(options.layers)
+    ):
+        make, sizes = LAYERED[name]
         h = sizes[int(level)]
         thickness, count, growth = (float(x) for x in given.split(":"))
         first = thickness * h / (growth ** np.arange(int(count))).sum()
         layers = clvoro.Layers(first, int(count), growth)
         row: dict[str, Any] = {"solid": name, "h": h, "layers": given, **dict.fromkeys(_EMPTY, float("nan"))}
-        row |= dict.fromkeys(("thickness", "full", "first", "aspect"), float("nan")) | {"prisms": 0, "plain": False}
+        row |= dict.fromkeys(("thickness", "full", "first", "aspect", "inner"), float("nan")) | {
+            "prisms": 0,
+            "plain": False,
+        }
         with tempfile.TemporaryDirectory() as folder:
             case = Path(folder) if options.keep is None else options.keep / f"{name}-{h:g}-{given}".replace(" ", "-")
             try:
@@ -255,6 +261,7 @@ def reached(result: clvoro.Result, layers: clvoro.Layers) -> dict[str, float]:
     thick = np.concatenate([thick, np.zeros(max(bare, 0))])
     return {
         "prisms": int((d.layer > 0).sum()),
+        "inner": float(np.abs(result.size_error[d.layer == 0]).mean()),
         "thickness": float(thick.mean()),
         "full": float((thick > _FULL).mean()),
         "first": float(first[first > _FULL].mean()) if (first > _FULL).any() else float("nan"),
@@ -408,8 +415,9 @@ def main() -> None:
     options_of.add_argument("--surfaces", action="store_true", help="domains with surfaces inside")
     options_of.add_argument("--domains", default="", metavar="NAMES", help=f"of --speed: {', '.join(DOMAINS)}")
     options = options_of.parse_args()
+    shapes: Any = SCENES if options.surfaces else LAYERED if options.layers else SHAPES
     for what, given, known in (
-        ("solid", () if options.booleans else names(options.only), SCENES if options.surfaces else SHAPES),
+        ("solid", () if options.booleans else names(options.only), shapes),
         ("resolution", names(options.resolutions), ("0", "1")),
         ("run", names(options.runs), RUNS),
         ("domain", names(options.domains), DOMAINS),
