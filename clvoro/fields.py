@@ -199,7 +199,9 @@ def _of_openfoam(path: Path, wanted: tuple[str, ...] | None, time: float | None)
     known = {one.name: one for one in case.fields(at) if one.in_cells}
     values = {}
     for name in _chosen(wanted, known):
-        rows = _of_dimension(known[name].internal.rows(foam.n_cells), dim)
+        rows = known[name].internal.rows(foam.n_cells)
+        if known[name].type == "vector":
+            rows = rows[:, :dim]  # the third one is round-off in the plane
         values[name] = rows[:, 0] if rows.shape[1] == 1 else rows
     return _Found(values, foam.centroids[:, :dim], domain=_domain_of(foam))
 

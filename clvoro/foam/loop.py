@@ -517,7 +517,10 @@ class _Loop:
         values = old.to_diagram(shown.internal.rows(old.foam.n_cells))
         view = None if old.foam.is_plane else "slice"
         figure = old.diagram.plot(np.linalg.norm(values, axis=1), view, label=shown.name)
-        figure.axes[0].set_title(f"cycle {row.cycle}: {old.foam.n_cells:,} cells", loc="left")
+        axes = figure.axes[0]
+        place = axes.get_title()  # of a section, in space
+        axes.set_title("")
+        axes.set_title(f"cycle {row.cycle}: {old.foam.n_cells:,} cells{place and ', '}{place}", loc="left")
         own = self.case.own
         figure.savefig(own / f"cycle-{row.cycle}.png", dpi=150)
         pyplot.close(figure)
