@@ -34,7 +34,11 @@ _SURE = 1.05
 
 
 def collapse_short(
-    mesh: Faces, diagram: Diagram, unwanted: np.ndarray | None = None, chosen: np.ndarray | None = None
+    mesh: Faces,
+    diagram: Diagram,
+    unwanted: np.ndarray | None = None,
+    chosen: np.ndarray | None = None,
+    suspects: np.ndarray | None = None,
 ) -> Faces:
     """Return `mesh` without edges shorter than 0.02 h and faces smaller than 0.001 h^2, where its cells stay valid.
 
@@ -54,12 +58,14 @@ def collapse_short(
         Faces that are collapsed whatever their size.
     chosen : (f,) bool, optional
         Faces whose corners may move; all by default.
+    suspects : (f,) bool, optional
+        `find_suspects(mesh, diagram)`, if they are known.
     """
-    suspects = _suspects(mesh, diagram)
+    suspects = find_suspects(mesh, diagram) if suspects is None else suspects
     if chosen is not None:
-        suspects &= chosen
+        suspects = suspects & chosen
     if unwanted is not None:
-        suspects |= unwanted
+        suspects = suspects | unwanted
     if not suspects.any():
         return mesh.compact()
     cells, faces = _fold(mesh, diagram)
@@ -87,7 +93,7 @@ def collapse_short(
     return mesh.compact() if unchanged else _unfold(mesh, cells, faces)
 
 
-def _suspects(mesh: Faces, diagram: Diagram) -> np.ndarray:
+def find_suspects(mesh: Faces, diagram: Diagram) -> np.ndarray:
     """Return a mask (f,) of the faces that may be small or skew, or have a short side: all of them, and a few others.
 
     All faces are read here, and never again. Their areas are those of the diagram.

@@ -104,7 +104,7 @@ def _collapsed_polygons(mesh: Faces, diagram: Diagram, parts: np.ndarray, collap
 
 
 def _collapsed_polyhedra(mesh: Faces, diagram: Diagram, parts: np.ndarray, collapse: bool) -> Faces:
-    from .collapse import collapse_short
+    from .collapse import collapse_short, find_suspects
     from .solid_walls.mend import spoiled_near_walls, with_neighbors
 
     del parts
@@ -113,7 +113,8 @@ def _collapsed_polyhedra(mesh: Faces, diagram: Diagram, parts: np.ndarray, colla
     whole = mesh.domain.uncut is mesh.domain and mesh.layer is None
     if not collapse or not whole:
         return mesh.compact()
-    made = collapse_short(mesh, diagram)
+    suspects = find_suspects(mesh, diagram)
+    made = collapse_short(mesh, diagram, suspects=suspects)
     if diagram.faces.diagram is not None:  # its cells are convex
         return made
     held = np.zeros(mesh.n_cells, bool)
@@ -122,7 +123,8 @@ def _collapsed_polyhedra(mesh: Faces, diagram: Diagram, parts: np.ndarray, colla
         if not rejected.any():
             break
         held |= with_neighbors(mesh, rejected)
-        made = collapse_short(mesh, diagram, chosen=~(held[mesh.owner] | held[np.maximum(mesh.neighbor, 0)]))
+        free = ~(held[mesh.owner] | held[np.maximum(mesh.neighbor, 0)])
+        made = collapse_short(mesh, diagram, chosen=free, suspects=suspects)
     return made
 
 

@@ -268,7 +268,7 @@ def test_suspects_are_all_that_would_be_flagged(meshes):
     diagram, before, _ = meshes
     cells, faces = collapse._fold(before, diagram)
     flagged = faces[collapse._Scan(cells, np.arange(len(cells.owner))).flagged]
-    suspects = collapse._suspects(before, diagram)
+    suspects = collapse.find_suspects(before, diagram)
     assert len(flagged)
     assert suspects[flagged].all()
     assert np.count_nonzero(~suspects) > 0

@@ -50,7 +50,8 @@ def spoiled_near_walls(before: Faces, made: Faces) -> np.ndarray:
 
     Such cells may have small defects before. A collapse may exchange these for others.
     """
-    judged = changed_cells(before, made) & with_neighbors(before, touching_walls(before))
+    near = with_neighbors(before, touching_walls(before))
+    judged = changed_cells(before, made, near) & near
     kept = with_neighbors(made, judged)
     cells, part = np.flatnonzero(kept), made.part(kept)[0]
     mine = judged[cells]
@@ -60,13 +61,17 @@ def spoiled_near_walls(before: Faces, made: Faces) -> np.ndarray:
     return found
 
 
-def changed_cells(before: Faces, made: Faces) -> np.ndarray:
-    """Return which cells of a mesh have been changed by `collapse_short`, (n,) bool."""
+def changed_cells(before: Faces, made: Faces, among: np.ndarray | None = None) -> np.ndarray:
+    """Return which cells of a mesh have been changed by `collapse_short`, (n,) bool.
+
+    Faces without a cell `among` (n,) bool are not examined.
+    """
     row = np.full(before.half_face.max() + 1, -1)
     row[before.half_face] = np.arange(len(before))
     rows = row[made.half_face]
-    changed = np.diff(made.starts) != np.diff(before.starts)[rows]
-    kept = np.flatnonzero(~changed)
+    mine = np.ones(len(made), bool) if among is None else among[made.owner] | among[np.maximum(made.neighbor, 0)]
+    changed = mine & (np.diff(made.starts) != np.diff(before.starts)[rows])
+    kept = np.flatnonzero(mine & ~changed)
     starts, corners = take_rows(made.starts, made.corners, kept)
     there = take_rows(before.starts, before.corners, rows[kept])[1]
     moved = np.zeros(len(corners), bool)
