@@ -5,11 +5,12 @@
 
 For each number of ranks the script starts itself under `mpiexec`; with PoCL each rank has one core. `bits` says whether
 the diagram of random points has the same bits as with the first number of ranks. The other columns are of a run in a
-box with sizes from h to 3 h. `CPU s` is the processor time of the second of two runs, summed over ranks; the first one
-builds kernels. `exchanges` and `reductions` are the rounds of messages between pairs of ranks, and of sums over all
-ranks, per step. `ghosts` is the number of ghosts of rank 0 in the last diagram over 2 d (n / p)^((d - 1) / d), an
-estimate of one layer of cells around a part. `rounds` is how often the cells of a diagram were made, in the mean: more
-than once where ghosts were missing. Needs `pip install -e '.[mpi]'`.
+box with sizes from h to 3 h, after a run of fewer cells, which builds kernels. `CPU s` is its processor time, summed
+over ranks, and `over one` the ratio to that of the first number of ranks. `exchanges` and `reductions` are the rounds
+of messages between pairs of ranks, and of sums over all ranks, per step. `ghosts` is the number of ghosts of rank 0 in
+the last diagram over 2 d (n / p)^((d - 1) / d), an estimate of one layer of cells around a part. `one round` is the
+share of diagrams whose cells were made once, since no ghosts were missing, and `asked` that for which ranks had to ask
+each other. Needs `pip install -e '.[mpi]'`.
 """
 
 from __future__ import annotations
@@ -37,11 +38,13 @@ COLUMNS = {
     "mean e": shown("error", ".4f"),
     "mean Q": shown("quality", ".4f"),
     "CPU s": shown("cpu", ".1f"),
+    "over one": shown("over_one", ".2f"),
     "iterations": shown("iterations", ".1f"),
     "exchanges": shown("exchanges", ".0f"),
     "reductions": shown("reductions", ".0f"),
     "ghosts": shown("ghosts", ".2f"),
-    "rounds": shown("rounds", ".2f"),
+    "one round": shown("one_round", ".0%"),
+    "asked": shown("asked", ".0%"),
 }
 
 
@@ -50,12 +53,14 @@ def measure_rank(options: argparse.Namespace) -> None:
     from mpi4py import MPI
 
     dim, cells, effort, comm = options.rank, options.cells, options.effort, MPI.COMM_WORLD
-    box, rounds, ghosts = clvoro.Box((0,) * dim, (1,) * dim), [], [0]
+    box, rounds, ghosts, asked = clvoro.Box((0,) * dim, (1,) * dim), [], [0], [0]
     adapter = clvoro.Adapter(clvoro.create_context(options.device), options.dtype, comm=comm)
     finish = PartSteps._finished
 
     def noted(steps, part, *given):
+        before = steps.asked
         found = finish(steps, part, *given)
+        asked[0] += steps.asked > before
         if found is not None:
             rounds.append(steps.rounds)
             ghosts[0] = part.count - part.n_own
@@ -71,6 +76,7 @@ def measure_rank(options: argparse.Namespace) -> None:
     h = factor * cells ** (-1 / dim)
     adapter.run(box, lambda p: 4 * h * (1 + 2 * p[:, 0]), effort)  # builds kernels
     rounds.clear()
+    asked[0] = 0
     began, calls = time.process_time(), (adapter._peers.exchanges, adapter._peers.reductions)
     mesh = adapter.run(box, lambda p: h * (1 + 2 * p[:, 0]), effort)
     spent = comm.allreduce(time.process_time() - began)
@@ -90,7 +96,8 @@ def measure_rank(options: argparse.Namespace) -> None:
             "exchanges": (adapter._peers.exchanges - calls[0]) / steps,
             "reductions": (adapter._peers.reductions - calls[1]) / steps,
             "ghosts": ghosts[0] / layer,
-            "rounds": float(np.mean(rounds)) if rounds else 1.0,
+            "one_round": float(np.mean(np.array(rounds) == 1)) if comm.size > 1 else 1.0,
+            "asked": asked[0] / len(rounds) if comm.size > 1 else 0.0,
         }
         print(json.dumps(figures))
 
@@ -110,14 +117,15 @@ def main() -> None:
     mpiexec = shutil.which("mpiexec", path=Path(sys.executable).parent) or "mpiexec"
     environment = {**os.environ, "POCL_MAX_PTHREAD_COUNT": "1"}
     for dim in options.dims:
-        table, first = Report(options.json, COLUMNS), ""
+        table, first = Report(options.json, COLUMNS), {}
         for ranks in options.ranks:
             command = [mpiexec, "-n", str(ranks), sys.executable, "-W", "ignore", __file__, *sys.argv[1:]]
             command += ["--rank", str(dim)]
             found = subprocess.run(command, env=environment, stdout=subprocess.PIPE, check=True)
             record = json.loads(found.stdout.splitlines()[-1])
-            first = first or record["digest"]
-            table.add(record | {"bits": "same" if record["digest"] == first else "differ"})
+            first = first or record
+            bits = "same" if record["digest"] == first["digest"] else "differ"
+            table.add(record | {"bits": bits, "over_one": record["cpu"] / first["cpu"]})
         table.finish(f"Ranks in {dim}D, effort {options.effort}")
 
 
