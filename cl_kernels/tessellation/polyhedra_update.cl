@@ -20,7 +20,9 @@
 
    In a periodic box neighbors are nearest images, as long as no vertex is as far from its generator as a quarter of a
    period. Then any two generators about a vertex are less than half a period apart, and all their cells see the same
-   images there. Cells without gap or overlap may cover the box more than once; the host compares the volumes. */
+   images there. Cells without gap or overlap may cover the box more than once; the host compares the volumes.
+
+   In a part of a domain ghosts have no cells. Cells beside them are clipped, and never wrong. */
 
 /* Largest difference of the areas of two half-faces, as a share of the area of the cell, where one is from a cell that
    was clipped. */
@@ -43,7 +45,7 @@ inline int list_planes(corners_t *cell, int i, REAL4 x, global const int *furthe
     if (n > MOST_FACES)
         return -1;
     for (int k = 0; k < n; ++k) {
-        if (lacks_wall(in->neighbors[start + k], in))
+        if (must_clip(in->neighbors[start + k], in))
             return -1;
         add_plane(cell, in->neighbors[start + k], x, in);
     }
@@ -55,7 +57,7 @@ inline int list_planes(corners_t *cell, int i, REAL4 x, global const int *furthe
         }
         if (next == INT_MAX)
             break;
-        if (cell->faces == MOST_FACES || lacks_wall(next, in))
+        if (cell->faces == MOST_FACES || must_clip(next, in))
             return -1;
         add_plane(cell, next, x, in);
         last = next;
@@ -209,19 +211,19 @@ kernel void begin_cell_updates(const int size, const int used, const int report_
         report[k] = k == REPORT_FACES ? used : 0;
 }
 
-/* Per generator i: its cell among its previous neighbors and `further` ones, with the measures of `clip_polyhedra`; or
-   row_counts[i] = UNFINISHED where the cell is open, has many faces, is near round-off, or is to be clipped. `which`
-   are all cells, or marked ones, which are `listed`, as ~i if they are to be clipped. Only these have further
-   neighbors.
+/* Per generator i of n: its cell among its previous neighbors and `further` ones, with the measures of
+   `clip_polyhedra`; or row_counts[i] = UNFINISHED where the cell is open, has many faces, is near round-off, or is to
+   be clipped. `which` are all cells, or marked ones, which are `listed`, as ~i if they are to be clipped. Only these
+   have further neighbors.
 
    `old_corners` and `old_keys`: the triples, from 2 old_starts[i] on, and keys of the previous cells; none if not
    `known`. Cells are written to their previous places, and those with more faces behind all these, from report[1] on.
    changed[i]: the set of its faces that neighbors must be compared with. */
-kernel void update_cells(const int size, const int which, global const int *listed, global const int *further,
-                         global const int *old_starts, global const int *old_neighbors, const int known,
-                         global const uchar4 *old_corners, global const uint *old_keys, global const REAL *points,
-                         CLIP_BOX_ARGS, const int room, CELL_OUTPUT_ARGS, global uint *keys, global int *changed,
-                         global int *more, global int *marks PERIOD_ARGS)
+kernel void update_cells(const int size, const int which, const int n, global const int *listed,
+                         global const int *further, global const int *old_starts, global const int *old_neighbors,
+                         const int known, global const uchar4 *old_corners, global const uint *old_keys,
+                         global const REAL *points, CLIP_BOX_ARGS, const int room, CELL_OUTPUT_ARGS, global uint *keys,
+                         global int *changed, global int *more, global int *marks PERIOD_ARGS)
 {
     LONG_ITEM(item);
     if (which == MARKED_CELLS && item >= report[REPORT_PLACED])
@@ -343,7 +345,7 @@ kernel void check_cells(const int size, const int room, global int *report, glob
     const bool certain = (row_counts[i] & CERTAIN) != 0, all = changed[i] == ALL_FACES;
     for (int f = 0; f < n; ++f) {
         const int k = begin + f, j = labels[k];
-        if (j < 0 || !(all || ((uint)changed[i] >> f & 1)) || row_counts[j] == UNFINISHED)
+        if (j < 0 || j >= size || !(all || ((uint)changed[i] >> f & 1)) || row_counts[j] == UNFINISHED)
             continue;
         const bool other_certain = (row_counts[j] & CERTAIN) != 0;
         if (!(certain || other_certain) || (j < i && changed[j] == ALL_FACES))

@@ -246,7 +246,7 @@ inline uint team_key(local team_cell_t *at, int lane)
 
 /* Per team and generator i: the cell of update_cells, with the same bits. A sum over vertices or faces is the work of
    one member, in their order. */
-kernel TEAM_GROUP void update_cells_by_teams(const int size, const int which, global const int *listed,
+kernel TEAM_GROUP void update_cells_by_teams(const int size, const int which, const int n, global const int *listed,
                                              global const int *further, global const int *old_starts,
                                              global const int *old_neighbors, const int known,
                                              global const uchar4 *old_corners, global const uint *old_keys,
@@ -293,7 +293,7 @@ kernel TEAM_GROUP void update_cells_by_teams(const int size, const int which, gl
     if (lane < before)
         cell->labels[lane] = old_neighbors[start + lane];
     TEAM_SYNC();
-    if (team_ballot(&team, lane < faces && lacks_wall(cell->labels[lane], &in)) != 0)
+    if (team_ballot(&team, lane < faces && must_clip(cell->labels[lane], &in)) != 0)
         return;
     cell->planes[lane] = lane < faces ? plane_of_face(cell->labels[lane], x, &in) : 0;
     at->origins[lane] = lane;

@@ -33,12 +33,13 @@ typedef struct {
     REAL4 periods;
 #endif
     own_t own;
+    int n; /* number of cells; generators from n on have none */
 } rows_t;
 
 /* The rows for generator i, from the arguments of a kernel. */
 #define ROWS(i)                                                                                                        \
     {                                                                                                                  \
-        old_starts, old_neighbors, more, points, box_lower, box_upper PERIODS, OWN_OF(i)                               \
+        old_starts, old_neighbors, more, points, box_lower, box_upper PERIODS, OWN_OF(i), n                            \
     }
 
 /* Number of the plane of its own that a cell has with this label; -1 if it has none. */
@@ -50,9 +51,11 @@ inline int own_plane_of(int label, const own_t *own)
     return found;
 }
 
-inline bool lacks_wall(int label, const rows_t *in)
+/* Whether a cell with a face of this label must be clipped: it has lost this wall, or no cell is behind it with which
+   the face could be compared. */
+inline bool must_clip(int label, const rows_t *in)
 {
-    return WALLS_MOVE && label < 0 && own_plane_of(label, &in->own) < 0;
+    return label >= in->n || (WALLS_MOVE && label < 0 && own_plane_of(label, &in->own) < 0);
 }
 
 /* The plane (p, d^2) between a generator at x and a neighbor or wall. */

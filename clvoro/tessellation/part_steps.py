@@ -13,6 +13,7 @@ their cells again.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -24,9 +25,11 @@ from ..errors import ClvoroError
 from ..geometry.domain import Domain
 from ..opencl.device_array import buffer_of
 from ..opencl.primitives import NamedArrays
+from .cut_cells import CutCells
 from .decomposition import hilbert_keys
 from .device_diagram import Follow, Tessellation
 from .part import Ghosts, Part
+from .polyhedra import Polyhedra
 from .stages import TessellationStages
 from .steps import DomainSteps, Sort
 
@@ -35,17 +38,18 @@ FIRST_REACH = 1.9, 2.4
 of their neighbors have to be final, too."""
 JUMP = 3
 """A new box begins where two successive generators on the curve are so many spacings apart."""
-CHUNK, CHUNKS = 16, 512
-"""Least number of generators in a box, and largest number of boxes, that say where the generators of a part are."""
 GROWTH, SKIN = 1.15, 0.15
 """Radius of the balls that a part asks for, over that of the balls that its cells need. How far any other generator
 may come nearer before one may be in a ball without being known, as a share of this radius."""
-NEAR = 3
-"""Where generators of other parts are more than so many radii of the largest ball away, only boxes are compared."""
+NEAR, FREE = 1.6, 0.8
+"""Where generators of other parts are more than so many radii of the largest ball away, only boxes are compared. Radius
+of a ball far from all others over their distance."""
 NOISE = {"float64": 1e-6, "float32": 1e-4}
 """Bound of the round-off of a reach, as a share of it."""
 FILLED, MATCHED = {"float64": 1e-8, "float32": 1e-3}, {"float64": 1e-5, "float32": 1e-3}
 """Largest differences of the volume of all cells from that of the domain, and of both sides of faces between parts."""
+MOST_GHOSTS = 0.5
+"""Number of ghosts over that of own generators from which on cells in 3D are built anew: too many are beside ghosts."""
 GROUP = 64
 """Number of balls around ghosts in a box."""
 FAILED = np.array([0.0, 0.0, 0.0, 0.0, 1.0])
@@ -76,11 +80,11 @@ class Chunks:
     def __init__(self, points: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> None:
         n = len(points)
         self.order = np.argsort(hilbert_keys(points, lower, upper), kind="stable")
-        count = max(1, min(CHUNKS, n // CHUNK))
+        count = math.isqrt(n)
         firsts = np.arange(count) * n // count
         ways = np.linalg.norm(np.diff(points[self.order], axis=0), axis=1)
-        spacings = np.full(count, float(np.prod(upper - lower) / n) ** (1 / len(lower)) / CHUNK)
-        if n > count:
+        spacings = np.full(count, float(np.prod(upper - lower) / n) ** (1 / len(lower)) / 16)
+        if n >= 2 * count:
             usual = np.median(ways[firsts[:, None] + np.arange(n // count - 1)], axis=1)
             spacings = np.maximum(spacings, usual)
         spacings = np.repeat(spacings, np.diff(np.append(firsts, n)))
@@ -214,9 +218,12 @@ class Answers:
 
 def gaps(boxes: np.ndarray, others: np.ndarray) -> np.ndarray:
     """Return the distances between `boxes` (k, 2 d) and `others` (m, 2 d), (k, m)."""
-    dim = boxes.shape[1] // 2
-    ways = np.maximum(others[None, :, :dim] - boxes[:, None, dim:], boxes[:, None, :dim] - others[None, :, dim:])
-    return np.sqrt((np.maximum(ways, 0) ** 2).sum(axis=2))
+    dim, ways2 = boxes.shape[1] // 2, np.zeros((len(boxes), len(others)))
+    for axis in range(dim):
+        below = np.subtract.outer(boxes[:, axis], others[:, dim + axis])
+        above = np.subtract.outer(boxes[:, dim + axis], others[:, axis])
+        ways2 += np.square(np.maximum(np.maximum(below, np.negative(above, out=above), out=below), 0, out=below))
+    return np.sqrt(ways2, out=ways2)
 
 
 def around(boxes: np.ndarray) -> np.ndarray:
@@ -292,7 +299,7 @@ class PartSteps(DomainSteps):
         self._corners = [corner[: engine.dim].astype(float) for corner in self.box.device_corners(engine.real)]
         self._labels, self._chunks = labels, Chunks(x, *self._corners)
         self._sent = [np.empty(0, np.int32) for _ in range(count)]
-        self._parts, self._rows = np.empty(0, int), np.empty(0, np.int32)
+        self._parts, self._rows, self._ghost_order = np.empty(0, int), np.empty(0, np.int32), np.empty(0, int)
         self._caps = FIRST_REACH[self._reads_rows] * self._chunks.spacings
         none = np.empty(0, int)
         answers = self._ask(x, none, self._caps, self._caps)
@@ -306,6 +313,7 @@ class PartSteps(DomainSteps):
         order = np.argsort(self._parts, kind="stable")
         self._parts, self._rows = self._parts[order], self._rows[order]
         self._ghosts = Ghosts.of_lists(engine, self.peers, self._parts, self._rows, self._sent)
+        self._ghost_order = np.empty(0, int)
         assert self._labels is not None
         labels, caps = self._labels.get()[:n], self._caps[:n]
         known = [np.column_stack([labels[rows], caps[rows]]) for rows in self._sent]
@@ -338,14 +346,20 @@ class PartSteps(DomainSteps):
     def update(
         self, sites: cla.Array, n: int, previous: Tessellation, sort: Sort, follow: Follow
     ) -> Tessellation | None:
-        """Update `previous` in 2D, with the cells of ghosts; all parts do it, or none."""
-        stages = self.stages
-        if not self._reads_rows:
-            return None
-        self.rounds = 0
+        """Update `previous`, in 2D with the cells of ghosts; all parts do it, or none."""
+        stages, self.rounds = self.stages, 0
         part = self.extend(sites, n)
         before = previous.whole or previous
-        t = stages.update.update(stages.cells, self.box, part.points, before, clip=None)
+        if before.part is not None and before.part.ghosts is not part.ghosts:
+            return None
+
+        def clip(cells: Polyhedra, cut: CutCells, report: cla.Array, _: int) -> None:
+            binned = stages.bins.build(self.box, part.points, part.count)
+            cells.clip_rest(cut, report, part, binned, before)
+
+        t = None
+        if self._reads_rows or part.count - n <= MOST_GHOSTS * n:
+            t = stages.update.update(stages.cells, self.box, part.points, before, clip=clip)
         if t is not None:
             part.order_rows(stages.engine, t, stages.cells.defines)
         made = self._finished(part, t)
@@ -434,8 +448,9 @@ class PartSteps(DomainSteps):
         """
         self.asked += 1
         own, n = self._chunks, len(self._chunks.order)
-        order = np.argsort(hilbert_keys(x[ghosts], *self._corners), kind="stable")
-        order = np.concatenate([own.order, n + order])
+        if len(self._ghost_order) != len(x) - n:
+            self._ghost_order = np.argsort(np.argsort(hilbert_keys(x[n:], *self._corners), kind="stable"))
+        order = np.concatenate([own.order, n + np.argsort(self._ghost_order[ghosts - n])])
         firsts = np.concatenate([own.firsts, np.arange(n, len(radii), GROUP)])
         centers = np.concatenate([x[:n], x[ghosts]])
         balls = BallGroups(centers, radii, order, firsts, len(own.firsts))
@@ -493,7 +508,7 @@ class PartSteps(DomainSteps):
         """Return the limits of own generators along the curve, (n,) each; see `is_within_limits` in part.cl.
 
         A generator that another part does not know has the distance of a skin from each ball of it at least. The
-        radius of a ball far from all others is half their distance.
+        radius of a ball far from all others is a share of their distance.
         """
         chunks = self._chunks
         n, k = len(chunks.order), len(chunks.firsts)
@@ -504,12 +519,12 @@ class PartSteps(DomainSteps):
             away = f.away[:k]
             ways, rooms = (
                 np.repeat(values, sizes)
-                for values in (away, np.maximum(skins.min(), away - np.maximum(largest.max(), away / 2)))
+                for values in (away, np.maximum(skins.min(), away - np.maximum(largest.max(), FREE * away)))
             )
             own = f.places < n
             places, to, gap = f.places[own], f.others[own], f.ways[own]
             np.minimum.at(ways, places[holds[to]], gap[holds[to]])
-            np.minimum.at(rooms, places, np.maximum(skins[to], gap - np.maximum(largest[to], gap / 2)))
+            np.minimum.at(rooms, places, np.maximum(skins[to], gap - np.maximum(largest[to], FREE * gap)))
             rooms[chunks.place[self._sent[number]]] = np.inf
-            free, room = np.minimum(free, ways / 2), np.minimum(room, rooms)
+            free, room = np.minimum(free, FREE * ways), np.minimum(room, rooms)
         return np.maximum(balls.radii[:n], free), room

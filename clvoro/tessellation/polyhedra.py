@@ -271,6 +271,8 @@ class Polyhedra(CellBuilder):
     ) -> None:
         """Clip the unfinished cells of `cut` by all generators and ghosts of `part` near them."""
         start, share = (True, previous.starts, previous.neighbors), self.engine.real.type(ROUGH_SHARE)
+        if part.labels is not None:
+            cut = replace(cut, state=UNSURE_CORNERS)
         self._clip(part, binned, cut, start, True, FACE_CAPACITY, share, part.halo_args, report)
 
     def match(

@@ -168,6 +168,7 @@ class _Rounds:
         engine = self._engine
         args = (
             np.int32(which),
+            np.int32(self._n),
             self._listed,
             self._further,
             *self._before,

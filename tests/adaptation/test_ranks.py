@@ -19,6 +19,7 @@ from clvoro.cli.ranks import this_rank
 from clvoro.errors import CheckpointWarning, InputError, InputTypeError, MissingLibraryError, OutputError, RankError
 from clvoro.io import arrays
 from clvoro.opencl.peers import Peers
+from clvoro.tessellation.part_steps import PartSteps
 from tests.reference.peers import run_parts
 
 ARRAYS = ("points", "volumes", "centroids", "neighbor_starts", "neighbors", "face_measures", "face_centroids")
@@ -108,6 +109,26 @@ def test_the_diagram_has_the_same_bits_in_any_number_of_parts(ctx, dim, dtype):
     for mesh in meshes[1:]:
         for name in ARRAYS:
             assert np.array_equal(getattr(mesh, name), getattr(meshes[0], name)), name
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_steps_have_the_same_bits_in_any_number_of_parts(ctx, dim, monkeypatch):
+    """Generators move by Lloyd's algorithm. Cells are made anew at first, and updated later."""
+    updated, update = [], PartSteps.update
+
+    def noted(steps, *given):
+        found = update(steps, *given)
+        updated.append((steps.peers.count, found is not None))
+        return found
+
+    monkeypatch.setattr(PartSteps, "update", noted)
+    box = clvoro.Box((0,) * dim, (6, *[1] * (dim - 1)))
+    x = np.random.default_rng(70102).random((1200, dim)) * box.extent
+    one, two, three = (run_in(parts, ctx, box, 0.1, points=x, method="lloyd", max_steps=6)[1] for parts in (1, 2, 3))
+    assert {(1, True), (2, True)} <= set(updated)
+    for mesh in (two, three):
+        assert np.array_equal(mesh.points, one.points)
+        assert np.array_equal(mesh.neighbors, one.neighbors)
 
 
 @pytest.mark.parametrize("dim", [2, 3])
