@@ -10,7 +10,8 @@ have the same size field, scaled to nearly the same number of cells; blocks foll
 have the same schemes. At Re 20 columns are errors in percent: of drag and lift by the function object `forceCoeffs`,
 and of the pressure difference between the front and the rear of the cylinder, for which a quadratic polynomial is
 fitted to the 48 nearest cells. At Re 100 they are the largest drag and lift of the last three periods, and the
-Strouhal number.
+Strouhal number. "Divergence" is the largest sum of the fluxes of a cell after they were projected onto a new mesh, over
+the largest flux.
 
 Lift is small, and random errors of the cells above and below the cylinder do not cancel. "Mirrored" is a mesh of the
 channel below the axis of the cylinder, with the mirror images of its generators above it, or of its cells with Gmsh.
@@ -192,8 +193,25 @@ def follow(
         "drag": last.monitors["forces.Cd"],
         "lift": last.monitors["forces.Cl"],
         "steps": last.time,
+        "divergence": divergence_of(case.folder, [row.time for row in rows[:-1]]),
         **seconds_of(rows),
     }
+
+
+def divergence_of(folder: Path, times: list[float]) -> float:
+    """Return the largest sum of the fluxes of a cell that were projected at some times, over the largest flux."""
+    case, worst = FoamCase(folder), 0.0
+    for at in (one for one in case.times() if one.value in times):
+        mesh = Mesh.of(folder, case.mesh_folder(at))
+        phi = next(field for field in case.fields(at) if field.name == "phi")
+        flux, inner = np.zeros(len(mesh.owner)), len(mesh.neighbor)
+        flux[:inner] = phi.internal.rows(inner)[:, 0]
+        for patch in mesh.patches:
+            if patch.kind != "empty":
+                flux[patch.faces] = phi.patches[patch.name]["value"].rows(len(patch.faces))[:, 0]
+        sums = np.bincount(mesh.owner, flux, len(mesh)) - np.bincount(mesh.neighbor, flux[:inner], len(mesh))
+        worst = max(worst, float(np.abs(sums).max() / np.abs(flux).max()))
+    return worst
 
 
 def seconds_of(rows: list[clvoro.foam.FoamCycle]) -> dict[str, float]:
@@ -580,7 +598,8 @@ def follow_vortices(case: Case, adapter: clvoro.Adapter, mesh: Mesh, n_cells: in
     end = rows[-1].time + 1.05
     known.set_control(endTime=end)
     case.run("pimpleFoam")
-    return {**shedding_of(case, end), **seconds_of(rows)}
+    divergence = divergence_of(case.folder, [row.time for row in rows[:-1]])
+    return {**shedding_of(case, end), "divergence": divergence, **seconds_of(rows)}
 
 
 def picture(case: Case, mesh: Mesh, path: Path, title: str) -> None:
@@ -634,12 +653,14 @@ STEADY = {
     "c_L %": lambda r: middle(r["lift"], "+.2f"),
     "pressure difference %": lambda r: spread(r["pressure"], "+.2f"),
     "iterations": lambda r: f"{np.median(r['steps']):.0f}",
+    "divergence": lambda r: f"{max(r['divergence']):.0e}" if "divergence" in r else "",
 }
 UNSTEADY = {
     "max c_D": lambda r: spread(r["drag"], ".4f"),
     "max c_L": lambda r: spread(r["lift"], ".4f"),
     "St": lambda r: spread(r["strouhal"], ".4f"),
     "steps": lambda r: f"{np.median(r['steps']):.0f}",
+    "divergence": STEADY["divergence"],
     "meshes, transfers %": lambda r: spread(100 * meshing_share(r), ".1f") if "mesh_seconds" in r else "",
 }
 
