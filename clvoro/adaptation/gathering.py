@@ -48,6 +48,12 @@ class ResultParts:
         """Call `work` in all parts. An error in one of them is raised in all."""
         self.engine.peers.agree(work)
 
+    def owners(self) -> np.ndarray:
+        """Return the part of each cell of the whole mesh, (n,) int, on part 0, and nothing on the others."""
+        labels = self.engine.peers.collect(self.labels)
+        parts = np.repeat(np.arange(len(labels)), [len(own) for own in labels])
+        return parts[np.argsort(np.concatenate([np.empty(0, np.int32), *labels]), kind="stable")]
+
     def gather(self, result: Result) -> Result | None:
         """Return the whole mesh on part 0, and None on the others."""
         peers = self.engine.peers

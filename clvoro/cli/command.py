@@ -142,11 +142,12 @@ def _add_output(run: Any) -> None:
         default=(),
         help=f"further mesh files, such as openfoam,nc: {', '.join(MESH_FILES)}",
     )
+    _add_processors(run)
     run.add_argument(
         "--pieces",
         action="store_true",
-        help="under mpiexec: each rank writes its own cells, mesh.pvtu in place of mesh.vtu and mesh.npz, a decomposed "
-        "case for openfoam, and no report; no rank holds the whole mesh",
+        help="under mpiexec: each rank writes its own cells, mesh.pvtu in place of mesh.vtu and mesh.npz, and no "
+        "report; no rank holds the whole mesh, but for --format openfoam",
     )
     _add_types(run)
     _add_walls(run)
@@ -188,6 +189,12 @@ def _add_walls(command: Any, more: str = "") -> None:
     )
 
 
+def _add_processors(command: Any) -> None:
+    command.add_argument(
+        "--processors", metavar="N", type=int, help="for OpenFOAM: also write a case decomposed for N processors"
+    )
+
+
 def _add_unchecked(command: Any) -> None:
     command.add_argument(
         "--unchecked", action="store_true", help="write a mesh for OpenFOAM even if its checkMesh rejects it"
@@ -210,6 +217,7 @@ def _add_convert(commands: Any) -> None:
     _add_types(convert)
     _add_walls(convert, more="; of a .vtu file: as in the domain is the default")
     _add_unchecked(convert)
+    _add_processors(convert)
 
 
 def _add_check(commands: Any) -> None:
@@ -462,6 +470,7 @@ def _run(arguments: argparse.Namespace) -> int:
         unchecked=arguments.unchecked,
         command=tuple(arguments.given),
         solver=arguments.check_solver,
+        processors=arguments.processors,
         peers=arguments.peers,
         pieces=arguments.pieces,
         share_gpus=arguments.share_gpus,
@@ -494,7 +503,7 @@ def _convert(arguments: argparse.Namespace) -> int:
 
     mesh = load(_readable(arguments.mesh))
     options = {"convention": arguments.convention, "walls": arguments.walls, "types": arguments.types or None}
-    options["check"] = False if arguments.unchecked else None
+    options |= {"check": False if arguments.unchecked else None, "processors": arguments.processors}
     during(f"writing {arguments.out}", False, lambda: write(mesh, arguments.out, **options))
     print(f"written: {written_names(arguments.out)}")
     return OK

@@ -85,6 +85,8 @@ class Job:
         Write a mesh for OpenFOAM even if its checkMesh rejects it.
     solver : "openfoam" or None
         Check the mesh by the criteria of this solver, and with its own program if that is installed.
+    processors : int or None
+        Write a decomposed case for OpenFOAM, too, for so many processors.
     peers : Peers
         The ranks of `mpiexec` that share the run: all of them have the same job. Rank 0 gathers the mesh and writes.
     pieces : bool
@@ -110,6 +112,7 @@ class Job:
     unchecked: bool = False
     solver: Solver | None = None
     command: tuple[str, ...] = ()
+    processors: int | None = None
     peers: Peers = ALONE
     pieces: bool = False
     share_gpus: bool = False
@@ -280,6 +283,8 @@ class Job:
             raise InputError(
                 f"walls is {self.walls!r}, and no mesh is written for OpenFOAM; add --format openfoam, or leave it out"
             )
+        if self.processors is not None and "openfoam" not in self.mesh_formats:
+            raise InputError("processors are given, and no mesh is written for OpenFOAM; add --format openfoam")
         if self.types and "openfoam" not in self.mesh_formats:
             raise InputError("types are given, and no mesh is written for OpenFOAM; add --format openfoam")
         name, domain = self.case.name, self.case.domain
@@ -323,7 +328,9 @@ class Job:
         for option in [word for word in words if word.startswith("--resume")]:
             at = words.index(option)
             del words[at : at + (1 if "=" in option else 2)]
-        print(f"clvoro: to go on: {shlex.join(['clvoro', *words, '--resume', str(files.path)])}", file=sys.stderr)
+        launcher = ["mpiexec", "-n", str(self.peers.count)] if self.peers.count > 1 else []
+        again = [*launcher, "clvoro", *words, "--resume", str(files.path)]
+        print(f"clvoro: to go on: {shlex.join(again)}", file=sys.stderr)
 
     @contextmanager
     def _stopping_cleanly(self) -> Iterator[None]:
@@ -372,6 +379,7 @@ class Job:
             options: dict[str, Any] = {"convention": convention}
             if kind == "openfoam":
                 options = {"walls": self.walls, "types": self.case.patches, "check": not self.unchecked}
+                options["processors"] = self.processors
             task = partial(write, main, self.out / name, **options)
             work = "solver mesh" if kind == "openfoam" else name
             tasks.append(partial(self._during, f"writing the {work}", task))
@@ -506,7 +514,7 @@ class Job:
         """Return the names of all files and folders that the run has written."""
         *others, _ = results
         found = [*self._mesh_files, "history.csv"]
-        places = "processor0/..." if self.pieces else "constant/polyMesh"
+        places = "constant/polyMesh" + ", processor0, ..." * (self.pieces or self.processors is not None)
         for kind in self.mesh_formats:
             found.append(MESH_FILES[kind][0] + f" (with {places})" * (kind == "openfoam"))
         found += [name for other in others for name in (self._mesh_file_of(other), f"history-{other}.csv")]

@@ -14,7 +14,7 @@ from ..arguments import check_path
 from ..errors import InputError, InputTypeError
 from ..finite_volumes.solver_mesh import WallShape
 from ..mesh.diagram import Diagram
-from ..mesh.results import Result
+from ..mesh.results import OtherParts, Result
 from .atomic import check_writable, make_folder
 from .cgns import write_cgns
 from .contents import Contents
@@ -148,9 +148,25 @@ def write(
                 f"cannot write {path} with {name}, which is for {' and '.join(_KINDS[of] for of in fits)}; save as "
                 f"{' or '.join(fits)} or leave it out"
             )
+    if suffix == ".foam" and contents.result is not None and contents.result.parts is not None:
+        _write_foam_of_ranks(contents.result, contents.result.parts, path, cell_data, given)
+        return
     if suffix != ".npz":
         contents.diagram.demand_cells(f"a {suffix} file")
     _WRITERS.get(suffix, write_foreign)(contents, path, **given)
+
+
+def _write_foam_of_ranks(
+    mesh: Result, parts: OtherParts, path: Path, cell_data: Mapping[str, ArrayLike] | None, given: dict[str, Any]
+) -> None:
+    """Gather the mesh of all ranks on rank 0, which writes it as a case with a processor for each rank."""
+    whole, owners = parts.gather(mesh), parts.owners()
+
+    def write_whole() -> None:
+        if whole is not None:
+            write(whole, path, cell_data, **{"processors": owners, **given})
+
+    parts.together(write_whole)
 
 
 def _write_netcdf(contents: Contents, path: Path, convention: str = "ugrid", units: str = "m") -> None:
@@ -182,7 +198,7 @@ _KINDS = {".foam": "OpenFOAM", ".nc": "netCDF", ".vtu": ".vtu"}
 _ENDS = {".foam": ".foam, or the folder polyMesh of a case", ".nc": ".nc", ".vtu": ".vtu"}
 _METHODS = {".foam": "to_openfoam", ".nc": "to_netcdf", ".vtu": "to_vtu"}
 _OPTIONS = {
-    ".foam": ("patches", "types", "thickness", "binary", "walls", "zones", "check"),
+    ".foam": ("patches", "types", "thickness", "binary", "walls", "zones", "check", "processors"),
     ".nc": ("convention", "units"),
     ".vtu": ("walls",),
 }

@@ -6,7 +6,8 @@ The seams of a periodic box become one pair of cyclic patches for each periodic 
 seams, so some faces lie between a cell and an image that is shifted in two or three directions. They are in the pair of
 the first of these directions. The vector from a face to the one across then differs within a patch. OpenFOAM of
 openfoam.com (tested: v1912) accepts that from a patch with the transform `noOrdering`, whose faces it takes in the
-order of the file; `translational` demands one vector for all.
+order of the file; `translational` demands one vector for all. Its decomposed cases are wrong at such patches. So there
+each vector has a pair of its own.
 """
 
 from __future__ import annotations
@@ -14,7 +15,6 @@ from __future__ import annotations
 import re
 import sys
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
 from itertools import chain
 from os import PathLike
 from pathlib import Path
@@ -33,52 +33,40 @@ from ..mesh.diagram import Diagram
 from ..mesh.faces import Faces
 from .atomic import atomic_file, atomic_folder, make_folder
 from .contents import Contents
+from .foam_parts import FoamPatch, FoamPiece, decompose, processors_of
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
 
-@dataclass(frozen=True)
-class FoamPatch:
-    """A part of the boundary.
+def cyclic_patches(mesh: Faces, apart: bool = False) -> tuple[list[FoamPatch], np.ndarray]:
+    """Return the pairs of patches of the faces at seams, and the order of these faces: upper, lower, upper, ...
 
-    Attributes
-    ----------
-    name, kind : str
-    size : int
-        Number of faces.
-    across : str
-        Of a cyclic patch: name of the patch across the seam. Its faces are the images of those of this one, in the same
-        order, and each begins with the image of the same corner.
-    separation : tuple of float
-        Of a cyclic patch: vector from its faces to those across; empty if it differs from face to face.
+    There is one pair for each periodic direction; with `apart` one for each vector between the cells, such as
+    ``xMaxyMin`` and ``xMinyMax``.
     """
-
-    name: str
-    kind: str
-    size: int
-    across: str = ""
-    separation: tuple[float, ...] = ()
-
-
-def cyclic_patches(mesh: Faces) -> list[FoamPatch]:
-    """Return the pairs of patches of the faces at seams, in the order of the faces: upper, lower, upper, ..."""
     made: list[FoamPatch] = []
-    shifts = mesh.shift[mesh.n_outer :].astype(np.int64)
+    shifts = mesh.shift[mesh.n_outer :][: np.count_nonzero(mesh.twin >= 0)].astype(np.int64)
     axes = np.argmax(shifts != 0, axis=1)
-    for axis in np.unique(axes).tolist():
-        both = shifts[axes == axis]
-        steps = both[: len(both) // 2]
-        upper, lower = (f"{'xyz'[axis]}{end}" for end in ("Max", "Min"))
+    lower = mesh.twin[mesh.n_outer :][: len(shifts)] < mesh.n_outer + np.arange(len(shifts))
+    steps = np.where(lower[:, None], -shifts, shifts)
+    codes = axes * 27 + (apart * (steps + 1) @ np.array([9, 3, 1])[: mesh.dim] if len(steps) else 0)
+    for code in np.unique(codes).tolist():
+        one = steps[(codes == code) & ~lower]
+        axis = axes[codes == code][0]
+        named = [axis, *(b for b in range(axis + 1, mesh.dim) if apart and one[0, b])]
+        upper, under = ("".join(f"{'xyz'[b]}{end[int(one[0, b] > 0)]}" for b in named) for end in _ENDS)
         there = back = ()
-        if (steps == steps[0]).all():
-            period = np.pad(steps[0] * np.array(mesh.domain.extent), (0, 3 - mesh.dim))
+        if (one == one[0]).all():
+            period = np.pad(one[0] * np.array(mesh.domain.extent), (0, 3 - mesh.dim))
             there, back = tuple((0 - period).tolist()), tuple(period.tolist())
-        made.append(FoamPatch(upper, "cyclic", len(steps), lower, there))
-        made.append(FoamPatch(lower, "cyclic", len(steps), upper, back))
-    return made
+        made.append(FoamPatch(upper, "cyclic", len(one), under, there))
+        made.append(FoamPatch(under, "cyclic", len(one), upper, back))
+    return made, np.lexsort([lower, codes])
 
 
+_ENDS = (("Min", "Max"), ("Max", "Min"))
+"""Ends of an axis for shifts below and above 0: of the patch on the upper side of a seam, and of the other one."""
 PatchType = Literal["wall", "patch", "symmetry", "symmetryPlane"]
 """Types of patches for `poly_mesh`."""
 _OPEN_PARTS = ("inlet", "outlet", "inflow", "outflow", "farfield", "freestream", "atmosphere")
@@ -93,6 +81,7 @@ def poly_mesh(
     thickness: float | None = None,
     walls: WallShape = "straight",
     check: bool = True,
+    apart: bool = False,
 ) -> tuple[Faces, list[FoamPatch], float]:
     """Describe `diagram` for OpenFOAM; faces without measure and points without a face are left out.
 
@@ -112,6 +101,8 @@ def poly_mesh(
         See `Diagram.solver_mesh`.
     check : bool, optional
         Whether OpenFOAM must accept the mesh.
+    apart : bool, optional
+        See `cyclic_patches`.
 
     Returns
     -------
@@ -140,7 +131,8 @@ def poly_mesh(
     groups = parts.index[-1 - mesh.neighbor[mesh.n_inner : mesh.n_outer]]
     counts = np.bincount(groups, minlength=len(parts.names)).tolist()
     made = [FoamPatch(*patch) for patch in zip(parts.names, kinds, counts, strict=True)]
-    made += cyclic_patches(mesh)
+    seams, order_of_seams = cyclic_patches(mesh, apart)
+    made += seams
     if len(cells) > len(mesh):
         made += [FoamPatch("back", "empty", mesh.n_cells), FoamPatch("front", "empty", mesh.n_cells)]
     own = {patch.name for patch in made[len(parts.names) :]}
@@ -151,6 +143,7 @@ def poly_mesh(
         )
     order = np.arange(len(cells))
     order[mesh.n_inner : mesh.n_outer] = mesh.n_inner + np.argsort(groups, kind="stable")
+    order[mesh.n_outer : len(mesh)] = mesh.n_outer + order_of_seams
     return cells.take_faces(order), made, mesh.area_change
 
 
@@ -200,7 +193,8 @@ _FILES = {
     "boundary": "polyBoundaryMesh",
     "faces": "faceList",
 }
-_ZONES = ("cellZones", "faceZones")
+_LISTS = ("cellProcAddressing", "faceProcAddressing", "pointProcAddressing", "boundaryProcAddressing")
+_OTHERS = ("cellZones", "faceZones", *_LISTS)
 _BYTE_ORDER = {"little": "LSB", "big": "MSB"}[sys.byteorder]
 _CHUNK = 1 << 14
 
@@ -224,8 +218,9 @@ def write_foam(
     walls: WallShape = "straight",
     zones: Mapping[str, ArrayLike] | None = None,
     check: bool = True,
+    processors: int | ArrayLike | None = None,
 ) -> None:
-    """Write a polyMesh.
+    """Write a polyMesh, and those of the `processors` of a decomposed case.
 
     Parameters
     ----------
@@ -239,6 +234,8 @@ def write_foam(
     zones : mapping, optional
         Zones of cells by name, one bool per cell each; see `MeshOutput.to_openfoam`. Without zones the files of those
         of an earlier mesh are removed.
+    processors : int or (n,) array of int, optional
+        See `MeshOutput.to_openfoam`.
     """
     contents.diagram.domain.require_flat(
         f"cannot write {path}: OpenFOAM's cells are polyhedra", "save as .nc with convention='mpas', or as .vtu"
@@ -252,52 +249,103 @@ def write_foam(
     for name, value in (("binary", binary), ("check", check)):
         if not isinstance(value, bool | np.bool_):
             raise InputTypeError(f"{name} is {value!r:.60} of type {type(value).__name__}, expected True or False")
-    mesh, made, change = poly_mesh(contents.diagram, patches, types, thickness, walls, check)
-    inner = mesh.n_inner
+    mesh, made, change = poly_mesh(contents.diagram, patches, types, thickness, walls, check, processors is not None)
     folder = polymesh_folder(path) or path
+    part = None if processors is None else processors_of(processors, mesh.generators)
+    if part is not None:
+        _refuse_other_processors(folder, int(part.max()) + 1)
     if folder != path:
         make_folder(path.parent)
         with atomic_file(path):  # first, because it fails if the folder is not writable
             pass
-    make_folder(folder)
-    note = f"nPoints:{len(mesh.points)} nCells:{mesh.n_cells} nFaces:{len(mesh)} nInternalFaces:{inner}"
     changed = f"straight walls change the area by {100 * change:+.3g} %" if change else ""
+    of_faces = _face_zones(contents.diagram, mesh)
+    _write_piece(FoamPiece.whole(mesh, made), folder, changed, binary, of_cells, of_faces)
+    if part is None:
+        return
+    count = int(part.max()) + 1
+    settings = folder.parent.parent / "system" / "decomposeParDict"
+    if not settings.exists():  # parallel programs of OpenFOAM ask for it
+        make_folder(settings.parent)
+        with atomic_file(settings) as file:
+            head = _header("decomposeParDict", "", False).replace("regIOobject", "dictionary")
+            coefficients = f"simpleCoeffs\n{{\n    n ({count} 1 1);\n    delta 0.001;\n}}\n"
+            file.write(f"{head}numberOfSubdomains {count};\nmethod simple;\n{coefficients}".encode("ascii"))
+    for number, piece in enumerate(decompose(mesh, made, part)):
+        own_cells = {name: piece.local_cells(rows) for name, rows in of_cells.items()}
+        own_faces = {name: piece.local_faces(*rows) for name, rows in of_faces.items()}
+        place = folder.parent.parent / f"processor{number}" / "constant" / "polyMesh"
+        _write_piece(piece, place, changed, binary, own_cells, own_faces, piece.addressing)
+
+
+def _refuse_other_processors(folder: Path, count: int) -> None:
+    """Raise if the case of `folder` has the mesh of a processor that a decomposition into `count` does not replace."""
+    case = folder.parent.parent
+    if folder.parent.name != "constant":
+        raise InputError(
+            f"cannot write {folder} for {count} processors, whose meshes are beside the folder constant; write into "
+            "CASE/constant/polyMesh, or CASE/name.foam"
+        )
+    number = count
+    if (case / f"processor{number}").exists():
+        raise InputError(
+            f"cannot write {case} for {count} processors: it has processor{number} of another decomposition; remove "
+            "the folders processor*, or choose another case"
+        )
+
+
+def _write_piece(
+    piece: FoamPiece,
+    folder: Path,
+    changed: str,
+    binary: bool,
+    of_cells: Mapping[str, np.ndarray],
+    of_faces: Mapping[str, tuple[np.ndarray, np.ndarray]],
+    addressing: Mapping[str, np.ndarray] | None = None,
+) -> None:
+    """Write the files of one polyMesh; those of zones and `addressing` that it does not have are removed."""
+    inner = len(piece.neighbor)
+    make_folder(folder)
+    note = f"nPoints:{len(piece.points)} nCells:{len(piece.cells)} nFaces:{len(piece.owner)} nInternalFaces:{inner}"
     notes = {"owner": note, "neighbour": note, "points": changed}
     if binary:
         lists = {
-            "points": _bytes(mesh.points, np.float64),
-            "faces": chain(_bytes(mesh.starts, np.int32), _bytes(mesh.corners, np.int32)),
-            "owner": _bytes(mesh.owner, np.int32),
-            "neighbour": _bytes(mesh.neighbor[:inner], np.int32),
+            "points": _bytes(piece.points, np.float64),
+            "faces": chain(_bytes(piece.starts, np.int32), _bytes(piece.corners, np.int32)),
+            "owner": _bytes(piece.owner, np.int32),
+            "neighbour": _bytes(piece.neighbor, np.int32),
         }
     else:
         lists = {
-            "points": _text(len(mesh.points), _vectors(mesh.points)),
-            "faces": _text(len(mesh.owner), _faces(mesh.starts, mesh.corners)),
-            "owner": _text(len(mesh.owner), _labels(mesh.owner)),
-            "neighbour": _text(inner, _labels(mesh.neighbor[:inner])),
+            "points": _text(len(piece.points), _vectors(piece.points)),
+            "faces": _text(len(piece.owner), _faces(piece.starts, piece.corners)),
+            "owner": _text(len(piece.owner), _labels(piece.owner)),
+            "neighbour": _text(inner, _labels(piece.neighbor)),
         }
-    lists["boundary"] = _text(len(made), [_boundary(made, inner).encode("ascii")])
+    lists["boundary"] = _text(len(piece.patches), [_boundary(piece.patches, inner).encode("ascii")])
     if of_cells:
         lists["cellZones"] = _text(len(of_cells), [_zone(name, rows, "cell") for name, rows in of_cells.items()])
-    of_faces = _face_zones(contents.diagram, mesh)
     if of_faces:
         made = [_zone(name, rows, "face", against) for name, (rows, against) in of_faces.items()]
         lists["faceZones"] = _text(len(made), made)
+    for name, numbers in (addressing or {}).items():
+        lists[name] = _text(len(numbers), _labels(numbers))
     # `faces` is moved last: a case without it is recognized as incomplete.
     with atomic_folder(folder / "faces") as target:
-        for name in [*(zone for zone in _ZONES if zone in lists), *_FILES]:
-            head = _header(name, notes.get(name, ""), binary and name not in ("boundary", *_ZONES))
+        for name in [*(other for other in _OTHERS if other in lists), *_FILES]:
+            head = _header(name, notes.get(name, ""), binary and name in _FILES and name != "boundary")
             with open(target.with_name(name), "wb") as file:
                 file.write(head.encode("ascii"))
                 file.writelines(lists[name])
-    for name in _ZONES:
+    for name in _OTHERS:
         if name not in lists:
             (folder / name).unlink(missing_ok=True)
 
 
 def _header(name: str, note: str, binary: bool) -> str:
-    kind = "faceCompactList" if binary and name == "faces" else _FILES.get(name, "regIOobject")
+    kind = "labelList" if name in _LISTS else _FILES.get(name, "regIOobject")
+    if binary and name == "faces":
+        kind = "faceCompactList"
     noted = f'    note        "{note}";\n' if note else ""
     arch = f'    arch        "{_BYTE_ORDER};label=32;scalar=64";\n' if binary else ""
     return (
@@ -419,6 +467,7 @@ def _boundary(patches: list[FoamPatch], start: int) -> str:
                 else "        transform       noOrdering;\n"
             )
             body += "        matchTolerance  0.0001;\n"
+        body += "".join(f"        {entry};\n" for entry in patch.entries)
         body += f"        nFaces          {patch.size};\n        startFace       {start};\n    }}\n"
         start += patch.size
     return body

@@ -138,7 +138,8 @@ class MeshOutput:
         ``.pvtu``
             For ParaView: the cells of each rank of MPI in a ``.vtu`` file beside it. All ranks save together.
         ``.../constant/polyMesh`` or ``CASE/name.foam``
-            A folder for OpenFOAM, alone or within a case that ParaView opens, too; `to_openfoam` has options.
+            A folder for OpenFOAM, alone or within a case that ParaView opens, too; `to_openfoam` has options. All ranks
+            of MPI write together: rank 0 gathers the mesh and writes a decomposed case.
         ``.cgns``
             CGNS (HDF5): polyhedra as NGON_n and NFACE_n, boundaries by their names, and cell data; with h5py.
         ``.nc``
@@ -183,6 +184,7 @@ class MeshOutput:
         walls: WallShape = "straight",
         zones: Mapping[str, ArrayLike] | None = None,
         check: bool = True,
+        processors: int | ArrayLike | None = None,
     ) -> None:
         """Write the mesh in a box, a polygon or a solid for OpenFOAM.
 
@@ -214,6 +216,12 @@ class MeshOutput:
             ``region-0``, ``region-1``, ..., and the faces on them the zone of faces ``lines``.
         check : bool
             Refuse a mesh that OpenFOAM's checkMesh rejects. With False it is written all the same.
+        processors : int or (n,) array of int, optional
+            Write a decomposed case, too, for parallel runs of OpenFOAM: its folders ``processor0``, ``processor1``, ...
+            have the meshes that `decomposePar` would make, and `reconstructPar` puts fields together again. The number
+            of processors, or the processor of each cell from 0 on. Parts have equal numbers of cells, divided
+            by planes across their longest extent. Over the ranks of MPI the default is one processor for each rank,
+            with its cells.
 
         Raises
         ------
@@ -224,7 +232,7 @@ class MeshOutput:
         from ..io import write
 
         options = {"patches": patches, "types": types, "thickness": thickness, "binary": binary, "walls": walls}
-        options |= {"zones": zones, "check": check}
+        options |= {"zones": zones, "check": check, "processors": processors}
         write(self._self, path, kind=".foam", **options)
 
     def to_netcdf(

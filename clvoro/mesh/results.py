@@ -66,6 +66,10 @@ class OtherParts(Protocol):
         """See `Result.gather`."""
         ...
 
+    def owners(self) -> np.ndarray:
+        """Return the part of each cell of the whole mesh, (n,) int, on part 0, and nothing on the others."""
+        ...
+
     def together(self, work: Callable[[], None]) -> None:
         """Call `work` in all parts. An error in one of them is raised in all."""
         ...

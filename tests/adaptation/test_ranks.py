@@ -83,6 +83,7 @@ def run_in(parts, ctx, *given, dtype="float64", path=None, **options):
         mesh = adapter.run(*given, **options)
         if path is not None:
             mesh.save(path)
+            mesh.save(path.with_name("case") / "case.foam")
         return mesh, mesh.gather()
 
     found = run_parts(parts, work)
@@ -159,6 +160,10 @@ def test_a_run_in_parts(ctx, dim, tmp_path):
         rows = np.searchsorted(np.sort(np.concatenate([m.parts.labels for m in meshes])), mesh.parts.labels)
         for array in ("points", "volumes", "size_error", "quality"):
             assert np.array_equal(getattr(mesh, array), getattr(whole, array)[rows])
+
+    for number, size in enumerate(sizes):
+        cells = tmp_path / f"case/processor{number}/constant/polyMesh/cellProcAddressing"
+        assert f"\n{size}\n(" in cells.read_text()
 
     pyvista = pytest.importorskip("pyvista")
     read = pyvista.read(tmp_path / "mesh.pvtu")
@@ -288,6 +293,9 @@ def test_what_the_command_refuses_over_ranks(tmp_path, monkeypatch):
         with pytest.raises(InputError, match="needs the whole mesh, and pieces"):
             Job(case, tmp_path, pieces=True, peers=ranks, **changed)._refuse_pieces()
         Job(case, tmp_path, peers=ranks, **changed)._refuse_pieces()
+    with pytest.raises(InputError, match="processors are given, and no mesh"):
+        Job(case, tmp_path, processors=2)._refuse_formats()
+    Job(case, tmp_path, processors=2, mesh_formats=("openfoam",))._refuse_formats()
     with pytest.raises(InputError, match="has 32 frames, expected one"):
         Job(load_case("spots"), tmp_path, peers=ranks)._refuse_pieces()
 
