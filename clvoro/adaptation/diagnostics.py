@@ -212,7 +212,8 @@ def warn_of_errors(result: Result) -> None:
     """
     amounts = np.abs(result.size_error)
     worst = int(amounts.argmax())
-    mean, largest = float(amounts.mean()), float(amounts[worst])
+    # Prisms have no error.
+    mean, largest = float(amounts[result.diagram.layer == 0].mean()), float(amounts[worst])
     # The caller may have given a large error target.
     settings = result.settings
     aimed = settings.get("error_target") if settings.get("method") == "adaptive" else None
@@ -225,8 +226,11 @@ def warn_of_errors(result: Result) -> None:
     place = diagram.domain.place_name(result.points[worst])
     near = [worst, *_ring(diagram, worst)]
     steep = any(abs(math.log(sizes[j] / sizes[i])) > math.log(STEEP) for i in near for j in _ring(diagram, i))
-    if diagram.layer[near].any():
-        why = "cells beside layers of prisms make room for them: use thinner layers there"
+    if diagram.layer.any():
+        why = (
+            "cells beside layers of prisms make room for them, and are too large where these are thinner than given: "
+            "use thinner layers"
+        )
     elif steep and any(diagram.shifts[slice(*diagram.neighbor_starts[i : i + 2])].any() for i in near):
         why = (
             "sizes jump at a seam of the periodic box: a field must have the period of the box; repeat its shapes one "
