@@ -129,8 +129,8 @@ class Run:
         self._stages, self._domain, self._options = stages, domain, options
         self._fixed = check_fixed(fixed, domain, stages.engine.real)
         self._files, self._callback, self._on_memory, self._alone = files, callback, on_memory, alone
-        # Over several parts displacements are not kept: generators change their part before the end.
-        self._whole = stages.engine.peers.count == 1
+        self._is_part = stages.engine.peers.count > 1
+        self._keeps_displacements = not self._is_part  # generators change their part before the end
         peers, source = stages.engine.peers, files.source
         self._begin(size, given, saved=None if source is None else peers.agree(lambda: Saved(source, peers)))
 
@@ -364,7 +364,7 @@ class Run:
                 while self._advance():
                     pass
             except KeyboardInterrupt:
-                if not self._whole:  # the other parts wait somewhere
+                if self._is_part:  # the other parts wait somewhere
                     raise
                 self.stop_reason = INTERRUPTED
                 # Of a step that has not ended the generators are good: the run that is resumed does it again.
@@ -385,9 +385,9 @@ class Run:
 
     def note(self, displacement: Displacement) -> None:
         """Keep the displacement of the first and of the last step on the host."""
-        if self._whole and self.initial is None:
+        if self._keeps_displacements and self.initial is None:
             self.initial = self.state.displacements(displacement)
-        if self._whole and self.position == self._last_step:
+        if self._keeps_displacements and self.position == self._last_step:
             self.final = self.state.displacements(displacement)
         self.solution = displacement.solution
 
@@ -499,7 +499,11 @@ class Run:
     def _read_result(self) -> Result:
         """Read the mesh. Raises InputError if cells of nearly coincident generators are wrong because of round-off."""
         mesh, final = self.state, self.final
-        if self._whole and self.steps and (final is None or self.rows[-1]["step"] == self.rows[-2]["step"]):
+        if (
+            self._keeps_displacements
+            and self.steps
+            and (final is None or self.rows[-1]["step"] == self.rows[-2]["step"])
+        ):
             # The last step was not known in advance, or generators have changed since.
             assert self.last is not None
             with mesh.engine.workspace.frame():
@@ -517,7 +521,7 @@ class Run:
         elif self._kept_rows is not None:
             origin = np.where(origin < 0, -1, self._kept_rows[origin]).astype(np.int32)
         parts = None
-        if not self._whole:
+        if self._is_part:
             parts = ResultParts(mesh.engine, self._domain, CellRows.of(mesh.t, mesh.labels))
         diagram, settings = mesh.fetch_diagram(), dict(self._settings)
         if self._options.layers and self._domain.extrudes_layers:

@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
 Made = TypeVar("Made")
-PATIENCE, NAPS = 30, (2e-5, 1e-3)
-"""A rank that waits for a message asks `PATIENCE` times at once. Then it sleeps between two questions for an eighth of
+PATIENCE, NAPS = 30, (1e-4, 2e-3)
+"""A rank that waits for a message asks `PATIENCE` times at once. Then it sleeps between two questions for a quarter of
 the time that it has waited, but within `NAPS`, in seconds. There may be more ranks than cores."""
 ALARM, CLOSE, CLOSED = 1, 2, 3
 """Tags of the message that a rank sends when it fails, of the exit code, and of the answer to that."""
@@ -218,7 +218,7 @@ class Ranks(Peers):
                 if self._alarms.Iprobe(tag=ALARM):
                     self._failed = self._alarms.recv(tag=ALARM)
                     raise RankError(self._failed)
-                time.sleep(min(max(waited / 8, NAPS[0]), NAPS[1]))
+                time.sleep(min(max(waited / 4, NAPS[0]), NAPS[1]))
                 waited = time.perf_counter() - began
 
     def fail(self, error: BaseException) -> None:
