@@ -15,10 +15,15 @@ from ..opencl.engine import Engine
 from ..opencl.memory_limits import available_memory, host_memory, in_bytes
 from ..opencl.workspace import KEPT
 from ..tessellation.cut_cells import clipping_space
+from ..tessellation.decomposition import UNBALANCED
 from .sampling.quadrature import DensityTree
 
 MAX_CELLS = 100_000_000
 """Limit of the 32-bit indices into rows of neighbors."""
+MAX_LABELS = 2_000_000_000
+"""Limit of the permanent numbers of generators, which parts share."""
+GHOST_LAYERS = {2: 2.8, 3: 2.2}
+"""Depth of the ghosts around a part over the size of cells; see `clvoro.tessellation.part_steps`."""
 SIZES = {
     "plane": {"run": (26, 86), "diagram": (65, 45), "power run": (74, 119), "power diagram": (75, 92)},
     "cut": {"run": (68, 79), "diagram": (94, 90), "power run": (171, 134), "power diagram": (125, 130)},
@@ -122,6 +127,15 @@ def estimate_memory(
     return float(cells) * (reals * engine.real.itemsize + integers * 4) + space + FIXED + extras.field_bytes
 
 
+def cells_of_part(n: float, dim: int, parts: int) -> float:
+    """Return the cells and ghosts of the largest of several `parts` with `n` cells in all.
+
+    Ghosts are a shell around a cube of cells, as deep as the balls that parts first ask for.
+    """
+    own = UNBALANCED * n / parts
+    return float(min((own ** (1 / dim) + 2 * GHOST_LAYERS[dim]) ** dim, n))
+
+
 def check_memory(
     engine: Engine,
     n: float,
@@ -134,6 +148,8 @@ def check_memory(
 ) -> float:
     """Check that the device has memory for `n` cells, and return the bytes needed (see `estimate_memory`).
 
+    Where parts share a run, these are the bytes of the largest part, with its ghosts.
+
     Raises
     ------
     MemoryLimitError
@@ -142,8 +158,9 @@ def check_memory(
     """
     device = engine.queue.device
     name, available = device.name.strip(), available_memory(device)
-    needed = estimate_memory(engine, n, domain, extras, run=run, power=power, exact=exact)
-    if n > MAX_CELLS:
+    own = n if engine.peers.count == 1 else cells_of_part(n, engine.dim, engine.peers.count)
+    needed = estimate_memory(engine, own, domain, extras, run=run, power=power, exact=exact)
+    if own > MAX_CELLS or n > MAX_LABELS:
         raise MemoryLimitError(
             f"the run has {n:.3g} cells, expected at most {MAX_CELLS:.3g}, the limit of 32-bit indices (they need "
             f"{in_bytes(needed)}, and the device has {in_bytes(available)}). Do h and the domain have the same unit "
@@ -154,6 +171,7 @@ def check_memory(
         "Do h and the domain have the same unit of length? If so, use a larger size, n_cells, dtype='float32' or "
         "another device"
     )
+    remedy += " for each rank, or more ranks" * engine.peers.shared
     if needed > available:
         raise MemoryLimitError(
             f"the size field requires {n:.3g} cells, which need {in_bytes(needed)} on the device; {name} has "

@@ -13,6 +13,7 @@ from ..geometry.domain import Domain
 from ..mesh.results import Result
 from ..opencl.engine import Engine
 from ..tessellation.readback.parts import CellRows
+from .estimates import check_memory
 
 _OF_CELLS = ("target_size", "size_error", "quality", "origin")
 """Arrays of a result with one row per cell."""
@@ -55,13 +56,21 @@ class ResultParts:
         return parts[np.argsort(np.concatenate([np.empty(0, np.int32), *labels]), kind="stable")]
 
     def gather(self, result: Result) -> Result | None:
-        """Return the whole mesh on part 0, and None on the others."""
+        """Return the whole mesh on part 0, and None on the others.
+
+        Raises
+        ------
+        MemoryLimitError
+            On part 0, if its device has not enough memory.
+        """
         peers = self.engine.peers
         rows, labels = self.rows.gather(peers), peers.collect(self.labels)
         found = {name: peers.collect(getattr(result, name)) for name in _OF_CELLS}
         if rows is None:
             return None
         order = np.argsort(np.concatenate(labels), kind="stable")
-        diagram = rows.diagram(self.engine.alone(), self.domain)
+        engine = self.engine.alone()
+        check_memory(engine, len(order), self.domain, run=False)
+        diagram = rows.diagram(engine, self.domain)
         arrays = {name: np.concatenate(values)[order] for name, values in found.items()}
         return dataclasses.replace(result, points=diagram.points, diagram=diagram, parts=None, **arrays)

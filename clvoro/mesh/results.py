@@ -163,6 +163,11 @@ class Result(Sealed, MeshOutput):
         """Return the mesh of all ranks on rank 0, with rows in the order of generators, and None on the others.
 
         All ranks call this together. The result of a run without ranks returns itself.
+
+        Raises
+        ------
+        MemoryLimitError
+            On rank 0, if its device does not hold the mesh; save it as ``.pvtu`` instead.
         """
         return self if self.parts is None else self.parts.gather(self)
 

@@ -7,17 +7,28 @@ import re
 import subprocess
 import sys
 import types
+from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 import clvoro
+from clvoro.adaptation import estimates
 from clvoro.cli.cases import load_case
 from clvoro.cli.jobs import Job
 from clvoro.cli.ranks import this_rank
-from clvoro.errors import CheckpointWarning, InputError, InputTypeError, MissingLibraryError, OutputError, RankError
+from clvoro.errors import (
+    CheckpointWarning,
+    InputError,
+    InputTypeError,
+    MemoryLimitError,
+    MissingLibraryError,
+    OutputError,
+    RankError,
+)
 from clvoro.io import arrays
+from clvoro.opencl.engine import Engine
 from clvoro.opencl.peers import Peers
 from clvoro.tessellation.part_steps import PartSteps
 from tests.reference.peers import run_parts
@@ -170,6 +181,29 @@ def test_a_run_in_parts(ctx, dim, tmp_path):
     assert read.n_cells == len(whole)
     assert np.isclose(read.cell_data["volume"].sum(), 1)
     assert np.array_equal(read.cell_data["error"], np.concatenate([mesh.size_error for mesh in meshes]))
+
+
+def test_parts_hold_what_one_device_does_not(ctx, monkeypatch):
+    """Ten parts need little more than a tenth; rank 0 refuses to gather what it does not hold."""
+    engines = [Engine(ctx, clvoro.Adapter(ctx).queue, 3, np.dtype(float), peers=peers) for peers in (Peers(), Peers())]
+    engines[1].peers.count = 10
+    needed = [estimates.check_memory(engine, 1e6) for engine in engines]
+    assert 0.1 < needed[1] / needed[0] < 0.2
+    given = clvoro.Box((0, 0), (1, 1)), 0.03
+    alone, few = (estimates.estimate_memory(clvoro.Adapter(ctx)._engine_for(given[0]), n) for n in (1111, 700))
+    monkeypatch.setattr(estimates, "available_memory", lambda _: (few + alone) / 2)
+    with pytest.raises(MemoryLimitError):
+        clvoro.Adapter(ctx).run(*given, method="lloyd", max_steps=0)
+
+    def work(peers):
+        adapter = clvoro.Adapter(ctx)
+        adapter._peers = peers
+        mesh = adapter.run(*given, method="lloyd", max_steps=0)
+        monkeypatch.setattr(estimates, "available_memory", lambda _: 1.0)
+        with pytest.raises(MemoryLimitError) if peers.number == 0 else nullcontext():
+            mesh.gather()
+
+    run_parts(4, work)
 
 
 def test_checkpoints_are_resumed_on_any_number_of_parts(ctx, tmp_path, monkeypatch):
