@@ -1,0 +1,150 @@
+"""Faults on one of the ranks of MPI at random moments: whether all ranks end, with one message and a whole checkpoint.
+
+    python bench/rank_faults.py [--times 100] [--ranks 3] [--seed 1] [--json]
+
+Each time `mpiexec` starts ``clvoro run`` over ranks, with a checkpoint after each step. On one rank something fails:
+the process is killed, a callback raises an error, its disk is full (RLIMIT_FSIZE), or it has another version or another
+case. `longest s` is the longest time from the fault to the end of `mpiexec`; on a full disk the run goes on without
+checkpoints and fails at its end, and no time is measured. Messages are lines "clvoro: ..." on the standard error: the
+most of one run, and the runs without any, as where a process is killed. `checkpoints` and `damaged` count the last
+checkpoints, and those that cannot be read. Needs `pip install -e '.[mpi]'`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import random
+import resource
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+from _common import Report, parser, shown
+
+from clvoro.adaptation.checkpoint import Saved
+from clvoro.cli import main as command
+from clvoro.errors import ClvoroError
+from clvoro.opencl import peers as parts
+
+KINDS = ("kill", "error", "full disk", "version", "input")
+COLUMNS = {
+    "fault": shown("fault", "s"),
+    "times": shown("times", "d"),
+    "longest s": shown("longest", ".2f"),
+    "most messages": shown("most", "d"),
+    "without": shown("without", "d"),
+    "checkpoints": shown("checkpoints", "d"),
+    "damaged": shown("damaged", "d"),
+    "hung": shown("hung", "d"),
+}
+CASE = """
+[domain]
+lower = [0.0, 0.0]
+upper = [1.0, 1.0]
+[size]
+kind = "constant"
+value = 0.1
+[run]
+effort = "fast"
+seed = {seed}
+"""
+LATEST = 120
+"""Seconds after which a run counts as hung."""
+
+
+def run_rank(folder: Path, kind: str, step: int) -> None:
+    """Run the case as a rank; the last one fails at about the step `step` of the run."""
+    from mpi4py import MPI
+
+    comm, seed = MPI.COMM_WORLD, 0
+    fails = comm.rank == comm.size - 1
+
+    def note() -> None:
+        (folder / "fault").write_text(repr(time.time()))
+
+    if fails and kind in ("version", "input"):
+        note()
+    if fails and kind == "version":
+        parts.__version__ = "0"
+    if fails and kind == "input":
+        seed = 1
+    from clvoro.adaptation.run import Run
+
+    record = Run.record
+
+    def noted(run: Run, progress: float | None = None) -> None:
+        record(run, progress)
+        if len(run.rows) == step and fails and kind in ("kill", "error", "full disk"):
+            note()
+            if kind == "kill":
+                os.kill(os.getpid(), 9)
+            if kind == "error":
+                raise OSError("the network is gone")
+            resource.setrlimit(resource.RLIMIT_FSIZE, (100, 100))
+
+    Run.record = noted  # type: ignore[method-assign]
+    case = folder / f"case{seed}.toml"
+    case.write_text(CASE.format(seed=seed))
+    out, state = folder / "out", folder / "state"
+    options = ["--pieces", "--quiet", "--out", str(out), "--checkpoint", str(state), "--checkpoint-every", "0"]
+    sys.exit(command(["run", str(case), *options]))
+
+
+def fail_once(kind: str, step: int, ranks: int) -> dict[str, float]:
+    """Return what one run does after a fault."""
+    mpiexec = shutil.which("mpiexec", path=Path(sys.executable).parent) or "mpiexec"
+    with tempfile.TemporaryDirectory(prefix="clvoro-") as name:
+        folder = Path(name)
+        given = [sys.executable, "-W", "ignore", __file__, "--rank", f"{folder}:{kind}:{step}"]
+        environment = {**os.environ, "POCL_MAX_PTHREAD_COUNT": "1"}
+        try:
+            done = subprocess.run(
+                [mpiexec, "-n", str(ranks), *given], env=environment, capture_output=True, text=True, timeout=LATEST
+            )
+        except subprocess.TimeoutExpired:
+            return {"hung": 1, "seconds": LATEST, "messages": 0, "there": 0, "damaged": 0}
+        ended, state = time.time(), folder / "state"
+        damaged = 0
+        if state.exists():
+            try:
+                Saved(state)
+            except ClvoroError:
+                damaged = 1
+        messages = [line for line in done.stderr.splitlines() if line.startswith("clvoro: ") and "warning" not in line]
+        began = float((folder / "fault").read_text()) if (folder / "fault").exists() else ended
+        seconds = 0.0 if kind == "full disk" else ended - began
+        return {"hung": 0, "seconds": seconds, "messages": len(messages), "there": state.exists(), "damaged": damaged}
+
+
+def main() -> None:
+    """Let runs fail, and print a table of the kinds of faults."""
+    p = parser(__doc__)
+    p.add_argument("--times", type=int, default=100, help="number of faults")
+    p.add_argument("--ranks", type=int, default=3, help="number of ranks")
+    p.add_argument("--seed", type=int, default=1, help="seed of the moments")
+    p.add_argument("--rank", help="FOLDER:KIND:STEP of a rank; used by the script itself")
+    options: argparse.Namespace = p.parse_args()
+    if options.rank:
+        folder, kind, step = options.rank.split(":")
+        run_rank(Path(folder), kind, int(step))
+    rng, found = random.Random(options.seed), {kind: [] for kind in KINDS}
+    for k in range(options.times):
+        kind = KINDS[k % len(KINDS)]
+        found[kind].append(fail_once(kind, rng.randint(1, 55), options.ranks))
+    table = Report(options.json, COLUMNS)
+    for kind, runs in found.items():
+        if runs:
+            record = {"fault": kind, "times": len(runs), "longest": max(run["seconds"] for run in runs)}
+            record |= {"most": max(run["messages"] for run in runs)}
+            record |= {"without": sum(run["messages"] == 0 for run in runs)}
+            sums = {"checkpoints": "there", "damaged": "damaged", "hung": "hung"}
+            table.add(record | {name: int(sum(run[key] for run in runs)) for name, key in sums.items()})
+    table.finish(f"Faults of one of {options.ranks} ranks")
+
+
+if __name__ == "__main__":
+    main()
