@@ -145,6 +145,11 @@ def test_ghosts_get_the_values_of_their_owners(ctx, dim, values, columns):
         device = stages.engine.upload(filled, values)
         part.forward(stages.engine, device)
         assert np.array_equal(device.get(), given[rows])
+        again = stages.engine.upload(filled, values)
+        names = stages.engine.upload(np.where(np.arange(len(rows)) < part.n_own, rows, 0), np.int32)
+        part.forward(stages.engine, again, names)
+        assert np.array_equal(again.get(), given[rows])
+        assert np.array_equal(names.get(), rows)
         peers = stages.engine.peers
         assert np.array_equal(peers.total(np.array([part.n_own])), [halves.n])
         assert peers.before(np.array([part.n_own])) == rows[0]
