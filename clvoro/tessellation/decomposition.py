@@ -16,16 +16,18 @@ UNBALANCED = 1.1
 """Generators are divided anew if the largest part has more than so many times the mean."""
 
 
-def hilbert_keys(points: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
+def hilbert_keys(points: np.ndarray, lower: np.ndarray, upper: np.ndarray, bits: int = BITS) -> np.ndarray:
     """Return the places along a Hilbert curve of `points` (n, d) in the box between two corners, (n,) uint64.
+
+    Coordinates are rounded to so many `bits`.
 
     The transformation is that of Skilling (2004), AIP Conf. Proc. 707, 381.
     """
     d, one = points.shape[1], np.uint64(1)
     with np.errstate(divide="ignore", invalid="ignore"):
         unit = np.nan_to_num((points - lower) / (upper - lower))
-    x = list(np.clip(unit * 2.0**BITS, 0, 2.0**BITS - 1).astype(np.uint64).T)
-    for bit in range(BITS - 1, 0, -1):
+    x = list(np.clip(unit * 2.0**bits, 0, 2.0**bits - 1).astype(np.uint64).T)
+    for bit in range(bits - 1, 0, -1):
         q, p = one << np.uint64(bit), (one << np.uint64(bit)) - one
         for a in range(d):
             flips = (x[a] & q) != 0
@@ -35,10 +37,10 @@ def hilbert_keys(points: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np
     for a in range(1, d):
         x[a] = x[a] ^ x[a - 1]
     t = np.zeros(len(points), np.uint64)
-    for bit in range(BITS - 1, 0, -1):
+    for bit in range(bits - 1, 0, -1):
         t = np.where(x[-1] & (one << np.uint64(bit)), t ^ ((one << np.uint64(bit)) - one), t)
     keys = np.zeros(len(points), np.uint64)
-    for bit in range(BITS - 1, -1, -1):
+    for bit in range(bits - 1, -1, -1):
         for a in range(d):
             keys = keys << one | (x[a] ^ t) >> np.uint64(bit) & one
     return keys

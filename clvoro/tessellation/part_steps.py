@@ -36,7 +36,9 @@ from .steps import DomainSteps, Sort
 FIRST_REACH = 1.9, 2.4
 """Radius of the first balls over the spacing of the generators around: if only own cells have to be final, and if those
 of their neighbors have to be final, too."""
-JUMP = 3
+ROUGH = 12
+"""Bits of the coordinates that order generators within a part."""
+JUMP = 8
 """A new box begins where two successive generators on the curve are so many spacings apart."""
 GROWTH, SKIN = 1.15, 0.15
 """Radius of the balls that a part asks for, over that of the balls that its cells need. How far any other generator
@@ -79,7 +81,7 @@ class Chunks:
 
     def __init__(self, points: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> None:
         n = len(points)
-        self.order = np.argsort(hilbert_keys(points, lower, upper), kind="stable")
+        self.order = np.argsort(hilbert_keys(points, lower, upper, ROUGH), kind="stable")
         count = math.isqrt(n)
         firsts = np.arange(count) * n // count
         ways = np.linalg.norm(np.diff(points[self.order], axis=0), axis=1)
@@ -449,7 +451,7 @@ class PartSteps(DomainSteps):
         self.asked += 1
         own, n = self._chunks, len(self._chunks.order)
         if len(self._ghost_order) != len(x) - n:
-            self._ghost_order = np.argsort(np.argsort(hilbert_keys(x[n:], *self._corners), kind="stable"))
+            self._ghost_order = np.argsort(np.argsort(hilbert_keys(x[n:], *self._corners, ROUGH), kind="stable"))
         order = np.concatenate([own.order, n + np.argsort(self._ghost_order[ghosts - n])])
         firsts = np.concatenate([own.firsts, np.arange(n, len(radii), GROUP)])
         centers = np.concatenate([x[:n], x[ghosts]])
