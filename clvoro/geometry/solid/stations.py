@@ -303,7 +303,7 @@ def _divide(
         if n >= min(_SAMPLES * reached[-1], _MOST):
             break
         n = int(min(2 * _SAMPLES * reached[-1], _MOST))
-    count = max(round(float(reached[-1]) - sum(ends) + 2), int(reached[-1] > shortest))
+    count = max(round(float(reached[-1]) - (sum(ends) - 2)), int(reached[-1] > shortest))
     if line.closed:
         count = max(count, 3)
     if ends == (1.0, 1.0):
