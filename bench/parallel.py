@@ -9,8 +9,8 @@ box with sizes from h to 3 h, after a run of fewer cells, which builds kernels. 
 over ranks, and `over one` the ratio to that of the first number of ranks. `exchanges` and `reductions` are the rounds
 of messages between pairs of ranks, and of sums over all ranks, per step. `ghosts` is the number of ghosts of rank 0 in
 the last diagram over 2 d (n / p)^((d - 1) / d), an estimate of one layer of cells around a part. `one round` is the
-share of diagrams whose cells were made once, since no ghosts were missing, and `asked` that for which ranks had to ask
-each other. Needs `pip install -e '.[mpi]'`.
+share of diagrams whose cells were made once, since no ghosts were missing, and `asked` how often ranks asked each other
+for ghosts, over the number of diagrams. Needs `pip install -e '.[mpi]'`.
 """
 
 from __future__ import annotations
