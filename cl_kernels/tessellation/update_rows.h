@@ -55,7 +55,9 @@ inline int own_plane_of(int label, const own_t *own)
    the face could be compared. */
 inline bool must_clip(int label, const rows_t *in)
 {
-    return label >= in->n || (WALLS_MOVE && label < 0 && own_plane_of(label, &in->own) < 0);
+    if (label < 0)
+        return WALLS_MOVE && own_plane_of(label, &in->own) < 0;
+    return label >= in->n;
 }
 
 /* The plane (p, d^2) between a generator at x and a neighbor or wall. */
