@@ -135,7 +135,7 @@ def test_steps_have_the_same_bits_in_any_number_of_parts(ctx, dim, monkeypatch):
 
     monkeypatch.setattr(PartSteps, "update", noted)
     box = clvoro.Box((0,) * dim, (6, *[1] * (dim - 1)))
-    x = np.random.default_rng(70102).random((1200, dim)) * box.extent
+    x = np.random.default_rng(70102).random((800, dim)) * box.extent
     one, two, three = (run_in(parts, ctx, box, 0.1, points=x, method="lloyd", max_steps=6)[1] for parts in (1, 2, 3))
     assert {(1, True), (2, True)} <= set(updated)
     for mesh in (two, three):
@@ -209,7 +209,8 @@ def test_parts_hold_what_one_device_does_not(ctx, monkeypatch):
 def test_checkpoints_are_resumed_on_any_number_of_parts(ctx, tmp_path, monkeypatch):
     """On as many parts with the same bits; a piece that one part cannot write leaves the last checkpoint whole."""
     given, state = (clvoro.Box((0, 0), (1, 1)), ramp(0.1)), tmp_path / "state"
-    options = {"effort": "fast", "checkpoint": clvoro.Checkpoint(state, 0)}
+    short = {"effort": "fast", "max_steps": 16}
+    options = {**short, "checkpoint": clvoro.Checkpoint(state, 0)}
     whole = run_in(2, ctx, *given, **options)[1]
     stopped = run_in(2, ctx, *given, **options, callback=lambda row: row["step"] == 11)[1]
     assert stopped.history["step"][-1] == 11
@@ -226,24 +227,24 @@ def test_checkpoints_are_resumed_on_any_number_of_parts(ctx, tmp_path, monkeypat
 
     with monkeypatch.context() as patch:
         patch.setattr(arrays, "write_arrays", fill_disk)
-        again = {"effort": "fast", "checkpoint": clvoro.Checkpoint(state, 0, resume=True)}
+        again = {**short, "checkpoint": clvoro.Checkpoint(state, 0, resume=True)}
         with pytest.warns(CheckpointWarning, match="no space left"):
             run_in(2, ctx, *given, **again, callback=lambda row: row["step"] == 13)
-    resumed = run_in(2, ctx, *given, effort="fast", checkpoint=clvoro.Checkpoint(None, 0, resume=state))[1]
+    resumed = run_in(2, ctx, *given, **short, checkpoint=clvoro.Checkpoint(None, resume=state))[1]
     for name in ARRAYS:
         assert np.array_equal(getattr(resumed, name), getattr(whole, name)), name
     for parts in (1, 3):
-        other = run_in(parts, ctx, *given, effort="fast", checkpoint=clvoro.Checkpoint(None, 0, resume=state))[1]
+        other = run_in(parts, ctx, *given, **short, checkpoint=clvoro.Checkpoint(None, resume=state))[1]
         assert other.check()
         assert other.history["step"][-1] == whole.history["step"][-1]
         assert abs(len(other) / len(whole) - 1) < 0.03
         assert np.array_equal(other.history["cells"][:12], whole.history["cells"][:12])
-    alone = clvoro.Adapter(ctx).run(*given, effort="fast", checkpoint=clvoro.Checkpoint(state, 0, resume=True))
+    alone = clvoro.Adapter(ctx).run(*given, **short, checkpoint=clvoro.Checkpoint(state, 0, resume=True))
     assert abs(alone.history["mean_error"][-1] / whole.history["mean_error"][-1] - 1) < 0.5
     run_in(2, ctx, *given, **options, callback=lambda row: row["step"] == 1)
     next(file for file in tmp_path.iterdir() if file.name.endswith(".1")).unlink()
     with pytest.raises((InputError, RankError), match="No such file"):
-        run_in(2, ctx, *given, effort="fast", checkpoint=clvoro.Checkpoint(None, resume=state))
+        run_in(2, ctx, *given, **short, checkpoint=clvoro.Checkpoint(None, resume=state))
 
 
 @pytest.mark.parametrize("change", [{"method": "transport"}, {"fixed": [(0.5, 0.5)]}])
