@@ -127,10 +127,10 @@ def test_what_does_not_go_with_lines_is_said(ctx):
             adapter.run(domain, 0.1, "fast", **more)
     close = BOX.with_lines([[(0.2, 0.5), (1.8, 0.5)], [(0.2, 0.5001), (1.8, 0.5001)]])
     with pytest.warns(MismatchWarning, match="no room"):
-        pairs = adapter.run(close, 0.1, "fast")
+        pairs = adapter.run(close, 0.1, "fast", max_steps=3)
     assert len(pairs) > 100
     with pytest.warns(MismatchWarning, match="layers"):
-        adapter.run(domain, 0.1, "fast", layers=clvoro.Layers(0.02, 2, edges=["xMin"]))
+        adapter.run(domain, 0.1, "fast", layers=clvoro.Layers(0.02, 2, edges=["xMin"]), max_steps=3)
 
 
 def test_pairs_in_part_of_a_domain():

@@ -316,7 +316,10 @@ def test_cures_are_repeated_where_cells_are_the_same(ctx):
 
 
 def test_generators_of_rejected_cells_are_moved_inside_of_the_solid():
-    """One of them in a corner is moved away from it; where there is no room, it stays."""
+    """So are those beside them. One in a corner is moved away from it; where there is no room, it stays."""
+    row = 0.5 + np.array([[0, 0, 0], [1.2 * H, 0, 0], [1.4 * H, 0, 0]])
+    moved = _moved(WallSurface(clvoro.Solid.box((0, 0, 0), (1, 1, 1))), row, np.full(3, H), np.array([0]), 0)
+    assert (moved != row).any(axis=1).tolist() == [True, True, False]
     solid = clvoro.Solid.box((0, 0, 0), (1, 1, 0.25 * H))
     x = np.array([[0.5, 0.5, 0.12 * H], [0.5, 0.2, 0.13 * H], [0.12 * H, 0.12 * H, 0.12 * H], [0.3, 0.3, 0.05 * H]])
     for move in range(3):

@@ -46,8 +46,8 @@ _FEW = 0.03
 """Largest share of generators without a cell; a solid with more of them is refused."""
 _PATIENCE, _ATTEMPTS = 3, 8
 """How often a mesh is made again without fewer rejected cells than before, and at all."""
-_MOVES, _MOVE = 3, 0.15
-"""How often generators of rejected cells are moved, and how far, over h."""
+_MOVES, _MOVE, _BESIDE = 4, 0.15, 1.3
+"""How often generators of rejected cells are moved, how far, and how far from them those are that move, too, over h."""
 _DEEP = 0.1
 """Least depth of moved generators in the solid, over h."""
 _MISSED = 0.1
@@ -153,7 +153,8 @@ def solid_diagram(
 ) -> Diagram:
     """Return the mesh of a solid as a diagram, without short edges at walls.
 
-    Where cells are still rejected in the end, their generators are moved a little, and the mesh is made again.
+    Where cells are still rejected in the end, generators of them and beside them are moved a little, and the mesh is
+    made again.
 
     Parameters
     ----------
@@ -220,8 +221,9 @@ def solid_diagram(
 
 
 def _moved(surface: WallSurface, points: np.ndarray, sizes: np.ndarray, rows: np.ndarray, move: int) -> np.ndarray:
-    """Return generators of which some are moved, each time in other directions; they stay inside."""
-    points = points.copy()
+    """Return generators, those of `rows` and beside them moved, each time in other directions; they stay inside."""
+    beside = scipy.spatial.KDTree(points).query_ball_point(points[rows], _BESIDE * sizes[rows])
+    rows, points = np.unique(np.concatenate(beside).astype(np.int64)), points.copy()
     away = np.random.default_rng(move).normal(size=(len(rows), 3))
     away *= (_MOVE * sizes[rows] / np.linalg.norm(away, axis=1))[:, None]
     for sign in (1, -1):
