@@ -64,7 +64,7 @@ def add_color_bar(axes: Any, paint: Paint, **options: Any) -> None:
         bar.locator = _EndsAndRound(low, high)
         bar.minorlocator = NullLocator()
     else:
-        bar.locator = _RoundSteps()
+        bar.locator = _RoundSteps(integers=bool((values == np.rint(values)).all()))
     if scheme.logarithmic:
         # Where the ends are close, two digits would be the same at all ticks.
         digits = 2 if high > 2 * low else 2 + int(np.ceil(np.log10(high / max(high - low, 1e-9 * high))))
@@ -107,10 +107,10 @@ def _length(axis: Any) -> tuple[float, bool]:
 
 
 class _RoundSteps(MaxNLocator):
-    """Round numbers, as many as the bar has room for."""
+    """Round numbers, as many as the bar has room for; with `integers` no others, as for regions and counts."""
 
-    def __init__(self) -> None:
-        super().__init__(steps=[1, 2, 5, 10])
+    def __init__(self, integers: bool) -> None:
+        super().__init__(steps=[1, 2, 5, 10], integer=integers)
 
     def tick_values(self, vmin: float, vmax: float) -> list[float]:
         length, lies = _length(self.axis)

@@ -135,6 +135,17 @@ def test_color_bar_of_a_flat_picture_is_below_it(adapter):
     assert bar.get_tightbbox().y0 >= -1
 
 
+def test_a_scale_of_integers_has_no_other_numbers(result):
+    ticks = {}
+    for divisor in (1, 2):
+        figure = plot_cells(result, np.arange(len(result)) % 4 / divisor)
+        figure.canvas.draw()
+        ((bar,),) = (ax.child_axes for ax in figure.axes)
+        ticks[divisor] = np.mod(bar.get_yticks(), 1)
+    assert not ticks[1].any()
+    assert ticks[2].any()
+
+
 def test_axes_of_a_plain_figure_make_room_for_the_color_bar(result):
     figure = Figure(figsize=(6, 4))
     plot_cells(result, "quality", figure.add_subplot())
