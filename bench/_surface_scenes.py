@@ -31,13 +31,13 @@ def sheet(*corners: Any) -> Arrays:
 
 
 def fault(through: Any, along: Any, down: Any) -> Arrays:
-    """Return a plane through a line, which divides it: the point `through` and the vectors `along` and `down`."""
+    """Return two rectangles that meet in the line through -+ along and reach to both sides by the vector `down`."""
     a, b = np.subtract(through, along), np.add(through, along)
     return joined(*(sheet(a, b, b + way, a + way) for way in (np.asarray(down), -np.asarray(down))))
 
 
 def bed(height: Callable[[np.ndarray, np.ndarray], np.ndarray], width: float, n: int = 40) -> Arrays:
-    """Return a surface over a square whose sides have the length `width`, and a little beyond it."""
+    """Return a surface z = height(x, y) over a square with sides `width`, and a little beyond it."""
     x, y = np.meshgrid(*2 * [np.linspace(-0.05 * width, 1.05 * width, n)], indexing="ij")
     k = np.arange(n * n).reshape(n, n)
     a, b, c, d = (part.ravel() for part in (k[:-1, :-1], k[1:, :-1], k[1:, 1:], k[:-1, 1:]))
@@ -59,7 +59,7 @@ def lens_at(center: Any, radius: float, depth: float, rings: int = 24) -> tuple[
 
 
 def boxes(*corners: Any) -> dict[str, Solid]:
-    """Return boxes between corners."""
+    """Return boxes between pairs of corners, by name."""
     return {f"part-{k + 1}": Solid.box(lower, upper) for k, (lower, upper) in enumerate(corners)}
 
 

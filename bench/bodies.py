@@ -15,8 +15,8 @@ those of the coefficient of drag in percent of a reference. With --samples sever
 counts that differ by one percent and with other seeds: shown are the median and the range.
 
 With --velocity "u %" is the L2 error of the velocity, linear between the cells, in percent of the norm of what the body
-changes of the stream. It has no sign, so that two errors do not cancel. The reference is the flow on a mesh of N cells:
-around the airfoil as "wake", around the sphere a structured one, within three diameters of the axis.
+changes of the stream. It has no sign, so that two errors do not cancel. The reference is the flow on a mesh of N cells,
+"wake" around the airfoil and structured around the sphere, where errors count within three diameters of the axis.
 
 --reference, such as 3000,12000,48000, finds the reference: on structured meshes of quadrilaterals between the body and
 the box, whose angles and ratios of radii are uniform; around the airfoil in the plane in which its chord is a circle.
@@ -105,10 +105,10 @@ def around_sphere() -> clvoro.Solid:
 
 
 def lines_of_airfoil() -> tuple[np.ndarray, np.ndarray, Callable[[np.ndarray], np.ndarray]]:
-    """Return section and square as a Joukowski map, which makes a circle of the chord, maps them, and the map back.
+    """Return section and square after a Joukowski map, and the inverse map.
 
-    The chord begins at the focus of the nose. At the sharp tail, where stresses have a singularity, sizes of cells are
-    proportional to the square of the angle.
+    The map makes a circle of a chord that begins at the focus of the nose. At the sharp tail, where stresses have a
+    singularity, sizes of cells are proportional to the square of the angle.
     """
     nose = 1.1019 * 0.12**2 / 2
 
@@ -126,7 +126,7 @@ def lines_of_airfoil() -> tuple[np.ndarray, np.ndarray, Callable[[np.ndarray], n
 
 
 def lines_of_sphere() -> tuple[np.ndarray, np.ndarray, Callable[[np.ndarray], np.ndarray]]:
-    """Return half of the sections of sphere and box; the box is round, with the length and area of the square one."""
+    """Return half of a section of the sphere and of a round box with the length and area of the square one."""
     wide = 12 / math.sqrt(math.pi)
     corners = np.array([10, 10 + 1j * wide, -6 + 1j * wide, -6])
     return 0.5 * np.exp(1j * np.linspace(0, math.pi, 1001)), along(corners), lambda z: z

@@ -10,8 +10,8 @@ have the same size field, scaled to nearly the same number of cells; blocks foll
 have the same schemes. At Re 20 columns are errors in percent: of drag and lift by the function object `forceCoeffs`,
 and of the pressure difference between the front and the rear of the cylinder, for which a quadratic polynomial is
 fitted to the 48 nearest cells. At Re 100 they are the largest drag and lift of the last three periods, and the
-Strouhal number. "Divergence" is the largest sum of the fluxes of a cell after they were projected onto a new mesh, over
-the largest flux.
+Strouhal number. Fluxes are projected onto each new mesh: "divergence" is the largest sum over the faces of a cell
+afterwards, over the largest flux.
 
 Lift is small, and random errors of the cells above and below the cylinder do not cancel. "Mirrored" is a mesh of the
 channel below the axis of the cylinder, with the mirror images of its generators above it, or of its cells with Gmsh.
@@ -199,7 +199,7 @@ def follow(
 
 
 def divergence_of(folder: Path, times: list[float]) -> float:
-    """Return the largest sum of the fluxes of a cell that were projected at some times, over the largest flux."""
+    """Return the largest sum of fluxes over the faces of a cell at some times, over the largest flux."""
     case, worst = FoamCase(folder), 0.0
     for at in (one for one in case.times() if one.value in times):
         mesh = Mesh.of(folder, case.mesh_folder(at))

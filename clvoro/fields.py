@@ -201,7 +201,7 @@ def _of_openfoam(path: Path, wanted: tuple[str, ...] | None, time: float | None)
     for name in _chosen(wanted, known):
         rows = known[name].internal.rows(foam.n_cells)
         if known[name].type == "vector":
-            rows = rows[:, :dim]  # the third one is round-off in the plane
+            rows = rows[:, :dim]  # in the plane the third component is round-off
         values[name] = rows[:, 0] if rows.shape[1] == 1 else rows
     return _Found(values, foam.centroids[:, :dim], domain=_domain_of(foam))
 
@@ -375,7 +375,7 @@ def _named(file: Variables, text: object) -> _Coordinates | None:
 
 
 def _places(file: Variables, coordinates: _Coordinates) -> np.ndarray:
-    """Return the places of values, (n, k), longitudes and latitudes in degrees; of faces the mean of their corners."""
+    """Return the places of values, (n, k), in degrees on a globe; those of faces are the means of their corners."""
     places = np.stack([file.data(name) for name in coordinates.names], axis=1)
     if coordinates.names[0] == "lonCell":
         places = np.degrees(places)

@@ -98,7 +98,7 @@ class Prepared:
 
 
 class GivenPoints(NamedTuple):
-    """What a run makes of the points of the caller.
+    """How a run uses the points of the caller.
 
     Attributes
     ----------
@@ -456,7 +456,7 @@ def _sample(prepared: Prepared) -> np.ndarray:
 
 
 def judge_points(prepared: Prepared, mesh: MeshState) -> GivenPoints:
-    """Return what the run makes of the points of the caller, whose mesh is `mesh`."""
+    """Return how the run uses the points of the caller, whose mesh is `mesh`."""
     options, n = prepared.options, mesh.total
     if prepared.points is None or not options.multilevel:
         return GivenPoints()

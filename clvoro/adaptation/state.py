@@ -100,8 +100,8 @@ class Setup:
         Generators with labels below `fixed` do not move.
     points : (k, d) ndarray
         Positions of those with the labels 0 to k - 1, on the finest level: first those of the caller, then those
-        around corners and creases, then those beside lines. The other fixed generators are those of layers. The size
-        of the cells beside lines, in layers, and around crowded creases is their target size.
+        around corners and creases, then those beside lines. The other fixed generators are those of layers. Cells
+        beside lines, in layers, and around crowded creases keep their size, which is their target size.
     factor : float
         Initial factor on the size field on the finest level.
     own_factor : float
@@ -109,7 +109,7 @@ class Setup:
     around : FixedGenerators or None
         Generators beside lines, or around corners or creases: the last of `points`.
     after_layers : Field or None
-        Sizes of cells that layers of prisms have compressed, where `sizing` has those before.
+        If layers of prisms compress cells, the sizes of cells afterwards; `sizing` has those before.
     """
 
     stages: Stages
@@ -125,7 +125,7 @@ class Setup:
 
     @property
     def first_sized(self) -> int:
-        """Label of the first generator whose cell has the target size that it has."""
+        """Label of the first generator whose cell keeps its size, as its target size."""
         return len(self.points) - (0 if self.around is None else self.around.n_sized)
 
     @property
@@ -531,9 +531,9 @@ class MeshState:
         self.evaluate_metric()
 
     def sizes_over_mesh(self) -> np.ndarray | None:
-        """Return for each row the size of its cell on the device over that of its cell in the mesh, (n,).
+        """Return the factors by which cells are larger on the device than in the mesh, which differs at curved walls.
 
-        Where the mesh has no such cell it is 1. None if all walls are straight, and cells are those of the mesh.
+        (n,), in the order of rows; 1 where the mesh lacks the cell. None if all walls are straight.
         """
         volumes = self.tessellator.steps.volumes_of_mesh(self.t, self.labels)
         if volumes is None:

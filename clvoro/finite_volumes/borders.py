@@ -55,7 +55,7 @@ def on_surfaces(diagram: Diagram, sheets: Sheets) -> Diagram:
         if not narrow.any():
             break
         made = _moved(collapse_short(made.faces, made, narrow, narrow), sheets, h)
-    # Then single faces are collapsed, each if fewer cells are rejected afterwards.
+    # Then single faces are collapsed where fewer cells are rejected afterwards.
     rejected, tried = _rejected(made), 0
     while len(rejected) and tried < _TRIALS:
         mesh = made.faces
@@ -128,6 +128,7 @@ def _with_pairs_only(mesh: Faces, rows: np.ndarray, small: np.ndarray, vertices:
     rows : (k,) int
         The faces on surfaces.
     small : (k,) bool
+        Which of these are small.
     vertices : (v,) int
         The corners of these faces.
     """
@@ -165,7 +166,7 @@ def _with_pairs_only(mesh: Faces, rows: np.ndarray, small: np.ndarray, vertices:
 
 
 def _relabeled(mesh: Faces, to: np.ndarray) -> Faces:
-    """Return a mesh whose vertices have become the vertices `to` (v,); faces with less than three are left out."""
+    """Return a mesh with vertices replaced by the vertices `to` (v,); faces with less than three are left out."""
     touched = np.unique(np.repeat(np.arange(len(mesh)), np.diff(mesh.starts))[to[mesh.corners] != mesh.corners])
     corners, stays = to[mesh.corners].astype(np.int32), np.ones(len(mesh.corners), bool)
     for begin, end in zip(mesh.starts[touched].tolist(), mesh.starts[touched + 1].tolist(), strict=True):
@@ -179,7 +180,7 @@ def _relabeled(mesh: Faces, to: np.ndarray) -> Faces:
 
 
 def _without_spikes(loop: list[tuple[int, int]]) -> list[tuple[int, int]]:
-    """Return a loop of vertices and their places without repeated vertices, and without ways there and back."""
+    """Return a loop of (vertex, place) without repeated vertices and edges that run there and back."""
     k = 0
     while k < len(loop) and len(loop) > 2:
         if loop[k][0] == loop[k - 1][0]:
@@ -204,7 +205,7 @@ def _vertices(faces: Faces, rows: np.ndarray, size: np.ndarray) -> tuple[np.ndar
 
 
 def _onto(mesh: Faces, sheets: Sheets, vertices: np.ndarray, size: np.ndarray) -> np.ndarray:
-    """Return the points of the surface to which vertices move; those on walls stay on them."""
+    """Return the points on the surface to which vertices move; vertices on walls stay there."""
     x = mesh.points[vertices]
     starts, corners = take_rows(mesh.starts, mesh.corners, np.arange(mesh.n_inner, len(mesh)))
     wall = np.repeat(-1 - mesh.neighbor[mesh.n_inner :], np.diff(starts))

@@ -460,7 +460,7 @@ class _Loop:
         if given is None:
             domain = foam.domain()
             with warnings.catch_warnings():
-                # No solver uses this diagram, but only the mesh of the case.
+                # The solver uses the mesh of the case, and not this diagram.
                 warnings.simplefilter("ignore", MismatchWarning)
                 return self.adapter.diagram(domain, foam.centroids[:, : domain.dim])
         if not isinstance(given, Diagram):

@@ -31,9 +31,9 @@ _FILLED = 0.8  # share of a gap that layers may fill
 _FACING = -0.5  # cosine between the normals of two walls that face each other
 _MOST = 32767  # layers of prisms: their numbers have 16 bits
 _SAMPLE = 1024  # points on walls at which sizes are averaged
-_INSIDE, _LEAST_RATIO = 1 << 14, 0.7  # points of a solid that are counted, least ratio of compressed cells
+_INSIDE, _LEAST_RATIO = 1 << 14, 0.7  # points to measure volumes beside walls, least factor on sizes of cells
 INNER_DEPTH, DEEPER = 2.0, 8.0
-"""How far from a wall with layers inner vertices move with it: this times h, and this times the thickness there."""
+"""Vertices move with a wall that gets layers if they are nearer to it than INNER_DEPTH h + DEEPER thickness."""
 OF_GAP = 0.15
 """Share of the distance to the opposite wall that layers of prisms fill."""
 _OWN = 0.9  # of its distance from its wall: a generator that is nearer to another wall than this is dropped
@@ -402,10 +402,9 @@ def count_prisms(domain: Domain, layers: Sequence[Layers], size: Callable[[np.nd
 
 
 def compression(domain: Domain, layer: Layers, h: float) -> tuple[float, float]:
-    """Return how much the prisms of `layer` compress the cells of a solid beside them, and how deep.
+    """Return by which factor the prisms of `layer` shrink the cells of size `h` below them, and down to which depth.
 
-    That is the ratio of the sizes of these cells, with prisms and without, and the depth below the walls up to which
-    cells move; `h` is their size.
+    Prisms push the vertices near walls inwards. They leave cells at a greater depth below the walls as they are.
     """
     solid = cast("Solid", domain)
     depth = INNER_DEPTH * h + DEEPER * layer.thickness

@@ -57,11 +57,11 @@ class FixedGenerators:
 
     @property
     def n_sized(self) -> int:
-        """Number of the last generators whose cells have as target size the size that they have."""
+        """How many of the last generators have cells that keep their size, as their target size."""
         return 0
 
     def with_others(self, others: FixedGenerators | None, room: Callable[[np.ndarray], np.ndarray]) -> FixedGenerators:
-        """Return these and those of `others` that are farther than room(points) from all of these."""
+        """Return these generators, and those of `others` that are farther than room(points) from all of these."""
         if others is None or not len(others):
             return self
         away = scipy.spatial.KDTree(self.points).query(others.points)[0]

@@ -267,8 +267,8 @@ def _item_boxes(begin: np.ndarray, end: np.ndarray, radius: np.ndarray) -> tuple
 
 
 _WALLS, _COMPRESSED, _FADING = 1024, 0.995, 0.4
-"""Points on walls whose sizes are averaged; ratio of sizes from which on prisms compress cells; over which share of the
-depth the ratio changes to 1."""
+"""Points on walls at which sizes are averaged; least factor on sizes that is neglected; share of the depth over which
+the factor grows to 1."""
 _GROWTH = 1.2
 """Growth of sizes beyond layers of constant height."""
 _CLASS = 1.4
@@ -289,12 +289,12 @@ def limit_beside_layers(size: object, domain: Domain, layers: Sequence[Layers]) 
 
 
 def before_layers(field: Field, domain: Domain, layers: Sequence[Layers]) -> Field:
-    """Return the sizes of cells of a solid that have those of `field` once layers of prisms have compressed them."""
+    """Return the sizes of cells of a solid before layers of prisms compress them to the sizes of `field`."""
     for layer in layers:
         walls, h = sample_walls(domain, layer, field, _WALLS)
         ratio, depth = compression(domain, layer, float(h.mean()))
         if ratio < _COMPRESSED:
-            # The ratio up to about this depth, and 1 beyond.
+            # The ratio near walls, and 1 beyond the depth.
             slope = (1 - ratio) / (_FADING * depth)
             begin = ratio - (1 - 0.5 * _FADING) * depth * slope
             ramp = Distance(walls, h_min=begin, slope=slope, h_max=1.0)

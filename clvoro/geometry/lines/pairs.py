@@ -60,7 +60,7 @@ class LinePairs(FixedGenerators):
 
     @property
     def n_sized(self) -> int:
-        """Number of generators: all of them."""
+        """The number of all generators: each cell keeps its size."""
         return len(self)
 
 

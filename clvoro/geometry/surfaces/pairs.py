@@ -31,7 +31,7 @@ _PARTS = 64  # parts of the domain's extent into which edges are divided to find
 _REACH = math.sqrt(0.5)  # distance of generators around a chord, over h
 _APART = math.radians(45)  # least angle between two of them in one sector
 _HEIGHT, _LONGEST_REACH = 0.38, 1.3  # of h: their least distance from patches there, and their largest from the chord
-_FROM_WALL = 0.25  # of h: so far from a wall the angle at which an edge meets it is measured
+_FROM_WALL = 0.25  # of h: distance from a wall at which the angle between it and an edge is measured
 _DEPTH_AT_WALL, _LONGEST_AT_WALL = 0.4, 2.5  # least distance of generators there from the wall, longest chord, over h
 _JOINED = 0.3  # of a radius: so near to its balls is the joint generator of two chains before it is fitted
 _BESIDE = 0.64  # of h: generators this near to a patch, straight above it, are those of its cells
@@ -44,7 +44,7 @@ _CANDIDATES = 16  # points among which each one of the first sample is chosen
 _SPACINGS = 0.9, 0.84, 0.78  # over h: least distances in the first sample
 _AROUND = 12  # neighbors among the points with which distances from generators are compared
 _MEET = 0.2  # of h: points of the sample whose distances differ by less meet at a place
-_STEPS_OF_PLACES, _MOST_STEP, _LEAST = 4, 0.15, 1e-9  # Newton's method for these: steps, longest step over h, damping
+_STEPS_OF_PLACES, _MOST_STEP, _LEAST = 4, 0.15, 1e-9  # Newton's method for places: steps, longest step over h, damping
 # A place moves back if its distance to generators shrinks below this share, or if it moves farther than this, over h.
 _SURE, _FARTHEST = 0.98, 0.2
 _MEETING = 4  # nearest points of the sample, of which those whose cells meet at a place are chosen
@@ -55,8 +55,8 @@ _CLEAR, _COARSE = 1.06, 0.03  # radius in which no other generators are, over th
 _ROOM = 0.4  # of h: least distance of generators that are no pair
 # Heights of generators shrink, step by step, until a wall is this share of them away.
 _AT_WALL, _SHRINKAGE, _SHRINKAGES = 0.7, 0.85, 8
-_OF_GAP, _LEAST_HEIGHT = 3.0, 0.28  # gaps between patches over heights, and the least height for them over h
-_OPPOSITE = 0.8  # patches beside each other are opposite to each other if the cosine to the normal is larger
+_OF_GAP, _LEAST_HEIGHT = 3.0, 0.28  # gap to another patch over heights of generators, and their least height over h
+_OPPOSITE = 0.8  # another patch is above or below if the way to it has a larger cosine to the normal
 _DEPTH = 0.6  # of its height: least distance of a generator from walls
 _STRAIGHT = 0.55  # of the height of a generator: least distance from surfaces
 _ROUNDS = 40
@@ -118,7 +118,7 @@ class _Fold(ChainOfChords):
 
 
 def _length_at_wall(line: Line, end: int, size: Callable[[np.ndarray], np.ndarray], domain: Domain) -> float:
-    """Return how long the chord at an end of a line on a wall is, over h: long if the line is not upright there."""
+    """Return the length over h of the chord at an end of a line on a wall: the more the line leans, the longer."""
     h = float(np.asarray(size(line.points[[end]]))[0])
     away = min(_FROM_WALL * h, 0.5 * line.at[-1])
     x = line.along(line.points, np.array([away if end == 0 else line.at[-1] - away]))
@@ -128,9 +128,9 @@ def _length_at_wall(line: Line, end: int, size: Callable[[np.ndarray], np.ndarra
 
 
 def _angles_of_generators(sheets: np.ndarray) -> tuple[np.ndarray, float]:
-    """Return the angles of the generators around a chord at which patches end in the directions `sheets` (m,).
+    """Return the angles of the generators around a chord at which patches end, and their distance from it over h.
 
-    With them is the distance of all from the chord, over h: the farther, the smaller the angle between two patches.
+    `sheets` (m,) are the angles of the patches. The distance is larger where two of them are closer to each other.
     """
     sheets = np.sort(sheets % (2 * math.pi))
     beside = choose_angles(sheets.tolist(), [], _APART)
@@ -313,7 +313,7 @@ class _Sample:
         on_wall = ~_inside(domain, foot[there])
         clear = np.ones(len(self.cloud), bool)
         clear[there[~on_wall]] = False
-        clear &= ~_beside_nodes(around, self.cloud, h)
+        clear &= ~_in_balls(around, self.cloud, h)
         self.raised = _relaxed(self.lifted, h**-2, h, np.column_stack([q, apart * patch]), count, clear)
         self.q, self.patch = self.raised[:, :3].copy(), np.rint(self.raised[:, 3] / apart).astype(int)
         feet = self._feet(self.q[n_fixed:], self.patch[n_fixed:])
@@ -345,7 +345,7 @@ class _Sample:
         return height
 
     def _gaps(self, q: np.ndarray, normals: np.ndarray, h: np.ndarray, patch: np.ndarray) -> np.ndarray:
-        """Return how far the next of the other patches is above or below the points `q` (n, 3) of patches, (n,)."""
+        """Return how far from points `q` (n, 3) of patches another patch above or below is, (n,), inf without one."""
         gap = np.full(len(q), math.inf)
         for other, triangles in enumerate(self.sheets.patches):
             rows = np.flatnonzero(patch != other)
@@ -496,8 +496,8 @@ class _Sample:
         )
 
 
-def _beside_nodes(around: AroundCreases, points: np.ndarray, h: np.ndarray) -> np.ndarray:
-    """Return for which `points` (n, 3) of patches generators at the height h / 2 are in a ball around an edge, (n,)."""
+def _in_balls(around: AroundCreases, points: np.ndarray, h: np.ndarray) -> np.ndarray:
+    """Return above which `points` (n, 3) of patches the height h / 2 is in a ball around an edge, (n,) bool."""
     found = np.zeros(len(points), bool)
     if len(around.centers):
         tree, radii = scipy.spatial.KDTree(points), np.array(around.radii)

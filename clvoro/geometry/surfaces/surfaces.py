@@ -107,7 +107,7 @@ class Surfaces(Borders):
     def check_within(self, domain: Domain) -> None:
         """Raise an `InputError` if surfaces are outside of a domain, reach periodic sides, or cross each other in it.
 
-        They may cross on its walls or beyond them, as the ends of nested pipes that leave it do.
+        They may cross on its walls or beyond them, as nested pipes that leave it do at their ends.
         """
         corners = self.surface.corners
         low, high, extent = corners.min(axis=(0, 1)), corners.max(axis=(0, 1)), float(domain.extent.max())
@@ -130,10 +130,10 @@ class Surfaces(Borders):
                 "within the box there; use walls, or move the surfaces"
             )
 
-        if len(pairs := self.surface.crossings()):
-            met = corners[pairs]
-            within = (met.max(axis=2) > domain.lower).all(axis=2) & (met.min(axis=2) < domain.upper).all(axis=2)
-            pairs = pairs[within.all(axis=1)]
+        pairs = self.surface.crossings()
+        met = corners[pairs]
+        within = (met.max(axis=2) > domain.lower).all(axis=2) & (met.min(axis=2) < domain.upper).all(axis=2)
+        pairs = pairs[within.all(axis=1)]
         if len(pairs):
             off = domain.boundary_distance(corners[pairs].reshape(-1, 3)).reshape(-1, 2, 3) > _ON_WALL * extent
             pairs = pairs[off.any(axis=(1, 2))]
