@@ -111,8 +111,8 @@ def create_context(device: str | cl.Device | None = None, *, fp64: bool = False,
     fp64 : bool
         Take only devices that compute in float64.
     comm : mpi4py.MPI.Comm, optional
-        All ranks of this communicator call this together. Of several GPUs of a node, equally good, each of its ranks
-        takes another one, in the order of ranks.
+        All ranks of this communicator call this together. The ranks of a node take its GPUs in turn, if several are
+        equally good.
 
     Returns
     -------
@@ -132,7 +132,7 @@ def create_context(device: str | cl.Device | None = None, *, fp64: bool = False,
 
 
 def context_of(ctx: cl.Context | None, real: np.dtype, place: int) -> cl.Context:
-    """Return `ctx`, or a context of `context_for`, whose device computes in `real`."""
+    """Return `ctx`, or a context of `context_for` if it is None, and check that its device computes in `real`."""
     found = context_for(None, real == np.float64, place) if ctx is None else ctx
     require_fp64(found, real)
     return found
@@ -171,22 +171,16 @@ def context_for(device: str | cl.Device | None, fp64: bool, place: int) -> cl.Co
 
 
 def _from_place(candidates: list[_Candidate], place: int) -> list[_Candidate]:
-    """Return `candidates`, best first, so that the one at `place` among the equally good best ones comes first."""
+    """Rotate the equally good best ones of `candidates`, which are sorted, so that the one at `place` comes first."""
     best = sum(c.rank == candidates[0].rank for c in candidates)
     first = place % max(best, 1)
     return [*candidates[first:best], *candidates[:first], *candidates[best:]]
 
 
 def place_on_node(peers: Peers) -> int:
-    """Return how many parts before this one are on the same machine. All parts call this together."""
-    return _nodes(peers)[: peers.number].count(socket.gethostname())
-
-
-def _nodes(peers: Peers) -> list[str]:
-    name = np.zeros(256, np.uint8)
-    own = socket.gethostname().encode()[:256]
-    name[: len(own)] = np.frombuffer(own, np.uint8)
-    return [found.tobytes().rstrip(b"\0").decode() for found in peers.gather(name)]
+    """Return how many parts with lower numbers run on the same machine. All parts call this together."""
+    node = socket.gethostname()
+    return peers.gather_text(node)[: peers.number].count(node)
 
 
 def pci_address(device: cl.Device) -> str:
@@ -209,15 +203,10 @@ def refuse_shared_gpus(peers: Peers, device: cl.Device) -> None:
     Raises
     ------
     InputError
-        On all parts. GPUs whose driver gives no PCI address count as different.
+        On all parts. A GPU whose driver gives no PCI address is not refused.
     """
     address = pci_address(device) if device.type & cl.device_type.GPU else ""
-    code = np.zeros(16, np.uint8)
-    code[: len(address)] = np.frombuffer(address.encode(), np.uint8)
-    places = [
-        f"{found.tobytes().rstrip(bytes(1)).decode()} of {node}" if found.any() else ""
-        for found, node in zip(peers.gather(code), _nodes(peers), strict=True)
-    ]
+    places = peers.gather_text(f"{address} of {socket.gethostname()}" if address else "")
     for number, place in enumerate(places):
         if place and (first := places.index(place)) < number:
             raise InputError(

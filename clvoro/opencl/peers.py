@@ -18,26 +18,27 @@ if TYPE_CHECKING:
 
 Made = TypeVar("Made")
 PATIENCE, NAPS = 30, (1e-4, 2e-3)
-"""A rank that waits for a message asks `PATIENCE` times at once. Then it sleeps between two questions for a quarter of
-the time that it has waited, but within `NAPS`, in seconds. There may be more ranks than cores."""
+"""A rank that waits for a message first asks for it `PATIENCE` times without a pause. Then it sleeps before each
+question, since there may be more ranks than cores: for a quarter of the time waited so far, within the limits `NAPS` in
+seconds."""
 ALARM, CLOSE, CLOSED = 1, 2, 3
-"""Tags of the message that a rank sends when it fails, of the exit code, and of the answer to that."""
+"""Tags of messages: a rank has failed, rank 0 sends the exit code, another rank has received it."""
 GRACE = 1.0
-"""Seconds that rank 0 waits for answers to the exit code. The others wait half as long again for the code."""
+"""Seconds for which rank 0 waits for answers to the exit code. The others wait 1.5 times as long for the code."""
 
 
 class Peers:
     """The parts of a domain as one of them sees them. All of them call the same methods in the same order.
 
-    This class is a part that is alone: the whole domain. Others replace `exchange` and `gather`.
+    This class stands for a domain in one part. Subclasses connect several parts: they replace `exchange` and `gather`.
 
     Attributes
     ----------
     number, count : int
         Number of this part; number of parts.
     shared : bool
-        Whether the run is one over ranks, even if there is a single rank: the faces of a cell are then in the order of
-        the labels of neighbors.
+        Whether the run is one over ranks, be it a single one. The faces of a cell are then in the order of the
+        permanent numbers of its neighbors.
     exchanges, reductions : int
         Calls of `exchange` and of `gather` so far.
     """
@@ -48,15 +49,15 @@ class Peers:
     def exchange(self, sent: Sequence[np.ndarray], sizes: ArrayLike | None = None) -> list[np.ndarray]:
         """Send array k to part k, and return what each part has sent to this one, in the order of parts.
 
-        Arrays may differ in their number of rows. `sizes` (p,) are the numbers of rows that this part gets, if all
-        parts know theirs.
+        Arrays may differ in their number of rows. If all parts know how many rows they receive from each part, they
+        give these numbers as `sizes` (p,), which saves a message.
         """
         return list(sent)
 
     def swap(self, sent: np.ndarray, sent_sizes: np.ndarray, received: np.ndarray, sizes: np.ndarray) -> None:
-        """Do the same as `exchange` with rows for all parts in one array, and write what arrives to `received`.
+        """Send the rows of one array to all parts, and write the rows of all parts to `received`.
 
-        The sizes (p,) are the numbers of rows for each part, and of rows from each part.
+        Both arrays are in the order of parts: `sent_sizes` (p,) rows go to each part, `sizes` (p,) come from each.
         """
         found = self.exchange(np.split(sent, np.cumsum(sent_sizes)[:-1]), sizes)
         np.concatenate(found, out=received)
@@ -73,31 +74,35 @@ class Peers:
     def before(self, values: Any) -> np.ndarray:
         """Return the sum of `values` over the parts before this one."""
         values = np.asarray(values)
-        earlier = self.gather(values)[: self.number] if self.count > 1 else []
-        return sum(earlier, np.zeros_like(values))
+        return sum(self.gather(values)[: self.number], np.zeros_like(values))
 
     def any(self, condition: bool) -> bool:
         """Return whether `condition` holds in any part."""
         return condition if self.count == 1 else bool(self.total(np.array(condition, np.int32)))
 
     def collect(self, values: np.ndarray) -> list[np.ndarray]:
-        """Return the `values` of all parts, which may differ in their number of rows, on part 0, else nothing."""
+        """Return the `values` of all parts on part 0, and [] on the others. Numbers of rows may differ."""
         found = self.exchange([values if part == 0 else values[:0] for part in range(self.count)])
         return found if self.number == 0 else []
+
+    def gather_text(self, text: str) -> list[str]:
+        """Return the `text` of each part, in their order."""
+        found = self.exchange([np.frombuffer(text.encode(), np.uint8)] * self.count)
+        return [sent.tobytes().decode() for sent in found]
 
     def agree(
         self, prepare: Callable[[], Made], describe: Callable[[Made], Mapping[str, object]] = lambda _: {}
     ) -> Made:
-        """Call `prepare` in all parts, and return what it returns, if `describe` gives the same values in all of them.
+        """Call `prepare` in all parts, check that they agree, and return the result of this part.
 
-        The version of clvoro counts, too.
+        `describe` names values of the result. They must be the same in all parts, and so must the version of clvoro.
 
         Raises
         ------
         InputError
-            On part 0, if values differ: names the first one.
+            On part 0, if values differ; the message names the first one.
         RankError
-            On the others; or if `prepare` raises an error in another part.
+            On the other parts, if values differ; or if `prepare` has raised an error in another part.
         """
         if self.count == 1:
             return prepare()
@@ -107,8 +112,7 @@ class Peers:
             told |= {name: str(value) for name, value in describe(made).items()}
         except Exception as caught:
             error, told["error"] = caught, f"{type(caught).__name__}: {caught}"
-        text = np.frombuffer(json.dumps(told).encode(), np.uint8)
-        found = [json.loads(sent.tobytes()) for sent in self.exchange([text] * self.count)]
+        found = [json.loads(text) for text in self.gather_text(json.dumps(told))]
         if error is not None:
             raise error
         for number, other in enumerate(found):
@@ -127,13 +131,13 @@ class Peers:
         return cast("Made", made)
 
     def fail(self, error: BaseException) -> None:
-        """Tell the others that this part fails. They raise a `RankError` where they wait for it."""
+        """Tell the others that this part has failed. Those that wait for a message raise a `RankError`."""
 
     def close(self, code: int) -> None:
-        """On part 0: give the others the exit `code`, and end all processes if one of them does not take it."""
+        """On part 0: send the exit `code` to the others, and end all processes if one of them does not answer."""
 
     def await_close(self) -> int | None:
-        """On other parts: return the exit code of part 0, or None if it does not give one in time."""
+        """On the other parts: return the exit code of part 0, or None if none arrives in time."""
         return None
 
     def abort(self, code: int) -> None:
@@ -144,7 +148,7 @@ ALONE = Peers()
 
 
 class Ranks(Peers):
-    """The ranks of an MPI communicator, which is duplicated: all of its ranks create this together.
+    """The ranks of an MPI communicator. It is duplicated, so all of its ranks create this object together.
 
     Parameters
     ----------
@@ -169,7 +173,7 @@ class Ranks(Peers):
         self._failed = ""
 
     def exchange(self, sent: Sequence[np.ndarray], sizes: ArrayLike | None = None) -> list[np.ndarray]:
-        """Tell the others the numbers of rows, if they do not know them, then send the rows."""
+        """Send the numbers of rows, unless all ranks know theirs, and then the rows."""
         self.exchanges += 1
         own, found = sent[self.number], np.empty(self.count, np.int64)
         if sizes is None:
@@ -260,9 +264,9 @@ class Ranks(Peers):
 
 
 def peers_of(comm: object) -> Peers:
-    """Return the parts that `comm` stands for: a communicator of mpi4py, or `Peers`; None stands for a part alone.
+    """Return the ranks of `comm`, a communicator of mpi4py, as `Peers`. `Peers` are returned as they are.
 
-    All ranks call this together.
+    None stands for a domain in one part. All ranks call this together.
 
     Raises
     ------
