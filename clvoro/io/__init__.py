@@ -159,7 +159,7 @@ def write(
 def _write_foam_of_ranks(
     mesh: Result, parts: OtherParts, path: Path, cell_data: Mapping[str, ArrayLike] | None, given: dict[str, Any]
 ) -> None:
-    """Gather the mesh of all ranks on rank 0, which writes it as a case with a processor for each rank."""
+    """Gather the mesh on rank 0, which writes it as a decomposed case: a processor has the cells of a rank."""
     whole, owners = parts.gather(mesh), parts.owners()
 
     def write_whole() -> None:

@@ -6,8 +6,8 @@ The seams of a periodic box become one pair of cyclic patches for each periodic 
 seams, so some faces lie between a cell and an image that is shifted in two or three directions. They are in the pair of
 the first of these directions. The vector from a face to the one across then differs within a patch. OpenFOAM of
 openfoam.com (tested: v1912) accepts that from a patch with the transform `noOrdering`, whose faces it takes in the
-order of the file; `translational` demands one vector for all. Its decomposed cases are wrong at such patches. So there
-each vector has a pair of its own.
+order of the file; `translational` demands one vector for all. OpenFOAM's decomposed cases are wrong at patches with
+`noOrdering`, so in those each vector has its own pair of patches.
 """
 
 from __future__ import annotations
@@ -33,17 +33,18 @@ from ..mesh.diagram import Diagram
 from ..mesh.faces import Faces
 from .atomic import atomic_file, atomic_folder, make_folder
 from .contents import Contents
-from .foam_parts import FoamPatch, FoamPiece, decompose, processors_of
+from .foam_parts import ADDRESSING, FoamPatch, FoamPiece, decompose, processors_of
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
 
 def cyclic_patches(mesh: Faces, apart: bool = False) -> tuple[list[FoamPatch], np.ndarray]:
-    """Return the pairs of patches of the faces at seams, and the order of these faces: upper, lower, upper, ...
+    """Return the patches of the faces at seams in pairs, the upper one first, and the order of the faces in them.
 
-    There is one pair for each periodic direction; with `apart` one for each vector between the cells, such as
-    ``xMaxyMin`` and ``xMinyMax``.
+    There is one pair for each periodic direction. With `apart` there is one for each vector across the seams, such as
+    ``xMaxyMin`` and ``xMinyMax``. The faces of one patch are the images of those of the other one, in the same order,
+    and each begins with the image of the same corner.
     """
     made: list[FoamPatch] = []
     shifts = mesh.shift[mesh.n_outer :][: np.count_nonzero(mesh.twin >= 0)].astype(np.int64)
@@ -56,17 +57,19 @@ def cyclic_patches(mesh: Faces, apart: bool = False) -> tuple[list[FoamPatch], n
         axis = axes[codes == code][0]
         named = [axis, *(b for b in range(axis + 1, mesh.dim) if apart and one[0, b])]
         upper, under = ("".join(f"{'xyz'[b]}{end[int(one[0, b] > 0)]}" for b in named) for end in _ENDS)
-        there = back = ()
-        if (one == one[0]).all():
-            period = np.pad(one[0] * np.array(mesh.domain.extent), (0, 3 - mesh.dim))
-            there, back = tuple((0 - period).tolist()), tuple(period.tolist())
-        made.append(FoamPatch(upper, "cyclic", len(one), under, there))
-        made.append(FoamPatch(under, "cyclic", len(one), upper, back))
+        period = np.pad(one[0] * np.array(mesh.domain.extent), (0, 3 - mesh.dim))
+        for name, across, vector in ((upper, under, 0 - period), (under, upper, period)):
+            transform = ["transform       noOrdering"]
+            if (one == one[0]).all():
+                numbers = " ".join(repr(x) for x in vector.tolist())
+                transform = ["transform       translational", f"separationVector ({numbers})"]
+            entries = (f"neighbourPatch  {across}", *transform, "matchTolerance  0.0001")
+            made.append(FoamPatch(name, "cyclic", len(one), entries))
     return made, np.lexsort([lower, codes])
 
 
 _ENDS = (("Min", "Max"), ("Max", "Min"))
-"""Ends of an axis for shifts below and above 0: of the patch on the upper side of a seam, and of the other one."""
+"""Ends of an axis in the names of two patches at a seam, the upper one first: for a shift below 0, and above 0."""
 PatchType = Literal["wall", "patch", "symmetry", "symmetryPlane"]
 """Types of patches for `poly_mesh`."""
 _OPEN_PARTS = ("inlet", "outlet", "inflow", "outflow", "farfield", "freestream", "atmosphere")
@@ -193,8 +196,7 @@ _FILES = {
     "boundary": "polyBoundaryMesh",
     "faces": "faceList",
 }
-_LISTS = ("cellProcAddressing", "faceProcAddressing", "pointProcAddressing", "boundaryProcAddressing")
-_OTHERS = ("cellZones", "faceZones", *_LISTS)
+_OTHERS = ("cellZones", "faceZones", *ADDRESSING)
 _BYTE_ORDER = {"little": "LSB", "big": "MSB"}[sys.byteorder]
 _CHUNK = 1 << 14
 
@@ -220,7 +222,7 @@ def write_foam(
     check: bool = True,
     processors: int | ArrayLike | None = None,
 ) -> None:
-    """Write a polyMesh, and those of the `processors` of a decomposed case.
+    """Write a polyMesh. With `processors` write a decomposed case, too: a polyMesh for each processor.
 
     Parameters
     ----------
@@ -251,9 +253,11 @@ def write_foam(
             raise InputTypeError(f"{name} is {value!r:.60} of type {type(value).__name__}, expected True or False")
     mesh, made, change = poly_mesh(contents.diagram, patches, types, thickness, walls, check, processors is not None)
     folder = polymesh_folder(path) or path
-    part = None if processors is None else processors_of(processors, mesh.generators)
-    if part is not None:
-        _refuse_other_processors(folder, int(part.max()) + 1)
+    part, count = None, 0
+    if processors is not None:
+        part = processors_of(processors, mesh.generators)
+        count = int(part.max()) + 1
+        _refuse_other_processors(folder, count)
     if folder != path:
         make_folder(path.parent)
         with atomic_file(path):  # first, because it fails if the folder is not writable
@@ -263,7 +267,6 @@ def write_foam(
     _write_piece(FoamPiece.whole(mesh, made), folder, changed, binary, of_cells, of_faces)
     if part is None:
         return
-    count = int(part.max()) + 1
     settings = folder.parent.parent / "system" / "decomposeParDict"
     if not settings.exists():  # parallel programs of OpenFOAM ask for it
         make_folder(settings.parent)
@@ -279,17 +282,16 @@ def write_foam(
 
 
 def _refuse_other_processors(folder: Path, count: int) -> None:
-    """Raise if the case of `folder` has the mesh of a processor that a decomposition into `count` does not replace."""
+    """Raise an error if the case of `folder` is decomposed for more than `count` processors: some meshes would stay."""
     case = folder.parent.parent
     if folder.parent.name != "constant":
         raise InputError(
             f"cannot write {folder} for {count} processors, whose meshes are beside the folder constant; write into "
             "CASE/constant/polyMesh, or CASE/name.foam"
         )
-    number = count
-    if (case / f"processor{number}").exists():
+    if (case / f"processor{count}").exists():
         raise InputError(
-            f"cannot write {case} for {count} processors: it has processor{number} of another decomposition; remove "
+            f"cannot write {case} for {count} processors: it has processor{count} of another decomposition; remove "
             "the folders processor*, or choose another case"
         )
 
@@ -303,7 +305,7 @@ def _write_piece(
     of_faces: Mapping[str, tuple[np.ndarray, np.ndarray]],
     addressing: Mapping[str, np.ndarray] | None = None,
 ) -> None:
-    """Write the files of one polyMesh; those of zones and `addressing` that it does not have are removed."""
+    """Write the files of one polyMesh. Remove files of zones and `addressing` that an earlier mesh has left."""
     inner = len(piece.neighbor)
     make_folder(folder)
     note = f"nPoints:{len(piece.points)} nCells:{len(piece.cells)} nFaces:{len(piece.owner)} nInternalFaces:{inner}"
@@ -343,7 +345,7 @@ def _write_piece(
 
 
 def _header(name: str, note: str, binary: bool) -> str:
-    kind = "labelList" if name in _LISTS else _FILES.get(name, "regIOobject")
+    kind = "labelList" if name in ADDRESSING else _FILES.get(name, "regIOobject")
     if binary and name == "faces":
         kind = "faceCompactList"
     noted = f'    note        "{note}";\n' if note else ""
@@ -458,15 +460,6 @@ def _boundary(patches: list[FoamPatch], start: int) -> str:
     body = ""
     for patch in patches:
         body += f"    {patch.name}\n    {{\n        type            {patch.kind};\n"
-        if patch.across:
-            body += f"        neighbourPatch  {patch.across};\n"
-            vector = " ".join(repr(x) for x in patch.separation)
-            body += (
-                f"        transform       translational;\n        separationVector ({vector});\n"
-                if patch.separation
-                else "        transform       noOrdering;\n"
-            )
-            body += "        matchTolerance  0.0001;\n"
         body += "".join(f"        {entry};\n" for entry in patch.entries)
         body += f"        nFaces          {patch.size};\n        startFace       {start};\n    }}\n"
         start += patch.size

@@ -1,9 +1,10 @@
 """Decomposed cases of OpenFOAM: the mesh of each processor, as `decomposePar` makes it.
 
-The cells of a processor keep their order, and so do its faces between two of them, which stay in OpenFOAM's order. A
-face between two processors is on a patch of each: in the order of the whole mesh on both, turned on that of its
-neighbor cell. Faces at a seam whose other side is on another processor are on a patch of type `processorCyclic`. The
-files `...ProcAddressing` name cells, faces, points and patches of the whole mesh, for `reconstructPar`.
+A processor has its cells, and the faces between them, in the order of the whole mesh, which is OpenFOAM's order. A face
+between two processors is on a patch of each of them. Both patches have their faces in the order of the whole mesh; on
+the processor that has the neighbor cell the faces are turned. Faces at a seam whose other side is on another processor
+are on a patch of type `processorCyclic`. The files `...ProcAddressing` have the numbers that cells, faces, points and
+patches have in the whole mesh. `reconstructPar` reads them.
 """
 
 from __future__ import annotations
@@ -17,6 +18,9 @@ from ..errors import InputError, InputTypeError
 from ..mesh.connectivity import distinct, take_rows, used_indices
 from ..mesh.faces import Faces
 
+ADDRESSING = ("cellProcAddressing", "faceProcAddressing", "pointProcAddressing", "boundaryProcAddressing")
+"""Files of a processor for `reconstructPar`."""
+
 
 @dataclass(frozen=True)
 class FoamPatch:
@@ -27,20 +31,13 @@ class FoamPatch:
     name, kind : str
     size : int
         Number of faces.
-    across : str
-        Of a cyclic patch: name of the patch across the seam. Its faces are the images of those of this one, in the same
-        order, and each begins with the image of the same corner.
-    separation : tuple of float
-        Of a cyclic patch: vector from its faces to those across; empty if it differs from face to face.
     entries : tuple of str
-        Further entries of the dictionary.
+        Further entries of its dictionary.
     """
 
     name: str
     kind: str
     size: int
-    across: str = ""
-    separation: tuple[float, ...] = ()
     entries: tuple[str, ...] = ()
 
 
@@ -60,9 +57,9 @@ class FoamPiece:
     cells, faces, used : (n,), (f,), (v,) int
         Numbers of cells, faces and points in the whole mesh.
     turned : (f,) bool
-        Which faces have the other orientation there.
+        Which faces have the opposite orientation in the whole mesh.
     patch_numbers : list of int
-        Number of each patch in the whole mesh, -1 for those between processors.
+        Number of each patch in the whole mesh; -1 for patches between processors.
     """
 
     points: np.ndarray
@@ -96,20 +93,19 @@ class FoamPiece:
 
     @property
     def addressing(self) -> dict[str, np.ndarray]:
-        """The lists for `reconstructPar`, by the names of their files. Numbers of faces begin with 1, with a sign."""
-        return {
-            "cellProcAddressing": self.cells,
-            "faceProcAddressing": np.where(self.turned, -1 - self.faces, 1 + self.faces),
-            "pointProcAddressing": self.used,
-            "boundaryProcAddressing": np.array(self.patch_numbers),
-        }
+        """The numbers in the files `ADDRESSING`. Those of faces begin with 1, and are negative for turned faces."""
+        faces = np.where(self.turned, -1 - self.faces, 1 + self.faces)
+        return dict(zip(ADDRESSING, (self.cells, faces, self.used, np.array(self.patch_numbers)), strict=True))
 
     def local_cells(self, cells: np.ndarray) -> np.ndarray:
-        """Return the numbers in this piece of those `cells` of the whole mesh that it has."""
+        """Return which cells of this piece are among the `cells` of the whole mesh, as numbers in this piece."""
         return np.flatnonzero(np.isin(self.cells, cells))
 
     def local_faces(self, faces: np.ndarray, against: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the same of `faces`, and which normals point against those of their zone, as `against` says there."""
+        """Return which faces of this piece are among `faces`, and whether their normals point against those of a zone.
+
+        `against` says that of `faces` in the whole mesh.
+        """
         rows = np.flatnonzero(np.isin(self.faces, faces))
         order = np.argsort(faces)
         there = order[np.searchsorted(faces, self.faces[rows], sorter=order)]
@@ -145,7 +141,10 @@ def processors_of(processors: object, centers: np.ndarray) -> np.ndarray:
 
 
 def bisect(points: np.ndarray, count: int) -> np.ndarray:
-    """Divide `points` (n, d) into `count` parts of nearly equal numbers by planes across their longest extent, (n,)."""
+    """Return the part of each of the `points` (n, d), (n,) int: `count` parts with nearly equal numbers of points.
+
+    Planes across the longest extent halve the points again and again.
+    """
     part = np.zeros(len(points), int)
     left = [(np.arange(len(points)), 0, count)]
     while left:
@@ -181,7 +180,7 @@ def decompose(mesh: Faces, patches: list[FoamPatch], part: np.ndarray) -> Iterat
         for k, patch in enumerate(patches):
             lists.append(begins[k] + np.flatnonzero((own & same)[begins[k] : ends[k]]))
             made.append(replace(patch, size=len(lists[-1])))
-        # A face at a seam is on two patches, each with an owner of its own; others have both cells themselves.
+        # A seam has each face twice, and a processor takes the one that it owns. Other faces are there once for both.
         shared = np.flatnonzero(~same & (own | ((there == p) & (of_patch < 0))))
         other = np.where(own[shared], there[shared], here[shared])
         for q in distinct(other):
@@ -205,10 +204,10 @@ def decompose(mesh: Faces, patches: list[FoamPatch], part: np.ndarray) -> Iterat
 
 
 def _between(p: int, q: int, size: int, seam: FoamPatch | None) -> FoamPatch:
-    """Return the patch of processor `p` with the faces towards processor `q`, of the patch `seam` if it is given."""
+    """Return the patch of processor `p` towards processor `q`; of faces on the cyclic patch `seam`, if it is given."""
     transform = "unknown" if seam is None else "translational"
     entries = (f"transform {transform}", f"myProcNo {p}", f"neighbProcNo {q}", "matchTolerance 0.0001")
     if seam is None:
-        return FoamPatch(f"procBoundary{p}to{q}", "processor", size, entries=entries)
+        return FoamPatch(f"procBoundary{p}to{q}", "processor", size, entries)
     name = f"procBoundary{p}to{q}through{seam.name}"
-    return FoamPatch(name, "processorCyclic", size, entries=(*entries, f"referPatch {seam.name}"))
+    return FoamPatch(name, "processorCyclic", size, (*entries, f"referPatch {seam.name}"))
