@@ -8,7 +8,10 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import os
+import shutil
 import statistics
+import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -110,6 +113,14 @@ def make_adapter(options: argparse.Namespace) -> clvoro.Adapter:
         return clvoro.Adapter(clvoro.create_context(options.device), dtype=options.dtype)
     except clvoro.ClvoroError as error:
         raise SystemExit(f"{type(error).__name__}: {error}") from error
+
+
+def run_ranks(ranks: int, script: Sequence[str], **settings: Any) -> subprocess.CompletedProcess[str]:
+    """Run a `script` (file, arguments) under `mpiexec`, with a core for each rank; see `subprocess.run`."""
+    mpiexec = shutil.which("mpiexec", path=Path(sys.executable).parent) or "mpiexec"
+    command = [mpiexec, "-n", str(ranks), sys.executable, "-W", "ignore", *script]
+    environment = {**os.environ, "POCL_MAX_PTHREAD_COUNT": "1"}
+    return subprocess.run(command, env=environment, stdout=subprocess.PIPE, text=True, **settings)
 
 
 def clock_of(options: argparse.Namespace, adapter: clvoro.Adapter | None = None) -> Callable[[], float]:

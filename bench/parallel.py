@@ -18,15 +18,11 @@ from __future__ import annotations
 import argparse
 import hashlib
 import json
-import os
-import shutil
-import subprocess
 import sys
 import time
-from pathlib import Path
 
 import numpy as np
-from _common import Report, counts, parser, shown
+from _common import Report, counts, parser, run_ranks, shown
 
 import clvoro
 from clvoro.tessellation.part_steps import PartSteps
@@ -114,14 +110,10 @@ def main() -> None:
     if options.rank:
         measure_rank(options)
         return
-    mpiexec = shutil.which("mpiexec", path=Path(sys.executable).parent) or "mpiexec"
-    environment = {**os.environ, "POCL_MAX_PTHREAD_COUNT": "1"}
     for dim in options.dims:
         table, first = Report(options.json, COLUMNS), {}
         for ranks in options.ranks:
-            command = [mpiexec, "-n", str(ranks), sys.executable, "-W", "ignore", __file__, *sys.argv[1:]]
-            command += ["--rank", str(dim)]
-            found = subprocess.run(command, env=environment, stdout=subprocess.PIPE, check=True)
+            found = run_ranks(ranks, [__file__, *sys.argv[1:], "--rank", str(dim)], check=True)
             record = json.loads(found.stdout.splitlines()[-1])
             first = first or record
             bits = "same" if record["digest"] == first["digest"] else "differ"

@@ -2,12 +2,12 @@
 
     python bench/rank_faults.py [--times 100] [--ranks 3] [--seed 1] [--json]
 
-Each time `mpiexec` starts ``clvoro run`` over ranks, with a checkpoint after each step. On one rank something fails:
-the process is killed, a callback raises an error, its disk is full (RLIMIT_FSIZE), or it has another version or another
-case. `longest s` is the longest time from the fault to the end of `mpiexec`; on a full disk the run goes on without
-checkpoints and fails at its end, and no time is measured. Messages are lines "clvoro: ..." on the standard error: the
-most of one run, and the runs without any, as where a process is killed. `checkpoints` and `damaged` count the last
-checkpoints, and those that cannot be read. Needs `pip install -e '.[mpi]'`.
+Each time `mpiexec` starts ``clvoro run`` over ranks, with a checkpoint after each step. The last rank fails: it is
+killed, its callback raises an error, its disk is full (RLIMIT_FSIZE), or it has another version or another case.
+`longest s` is the longest time from the fault to the end of `mpiexec`. It is not measured on a full disk, since the run
+then goes on without checkpoints and fails at its end. `most messages` is the largest number of lines "clvoro: ..." on
+the standard error of one run; `without` counts the runs that print none, as where a process is killed. `checkpoints`
+counts the runs that leave a checkpoint, `damaged` the checkpoints that cannot be read. Needs `pip install -e '.[mpi]'`.
 """
 
 from __future__ import annotations
@@ -16,16 +16,16 @@ import argparse
 import os
 import random
 import resource
-import shutil
 import subprocess
 import sys
 import tempfile
 import time
 from pathlib import Path
 
-from _common import Report, parser, shown
+from _common import Report, parser, run_ranks, shown
 
 from clvoro.adaptation.checkpoint import Saved
+from clvoro.adaptation.run import Run
 from clvoro.cli import main as command
 from clvoro.errors import ClvoroError
 from clvoro.opencl import peers as parts
@@ -42,68 +42,56 @@ COLUMNS = {
     "hung": shown("hung", "d"),
 }
 CASE = """
-[domain]
-lower = [0.0, 0.0]
-upper = [1.0, 1.0]
-[size]
-kind = "constant"
-value = 0.1
-[run]
-effort = "fast"
-seed = {seed}
+domain = {{lower = [0.0, 0.0], upper = [1.0, 1.0]}}
+size = {{kind = "constant", value = 0.1}}
+run = {{effort = "fast", seed = {seed}}}
 """
 LATEST = 120
 """Seconds after which a run counts as hung."""
 
 
 def run_rank(folder: Path, kind: str, step: int) -> None:
-    """Run the case as a rank; the last one fails at about the step `step` of the run."""
+    """Run the case on this rank. The last rank fails: before the run, or after about `step` steps."""
     from mpi4py import MPI
 
-    comm, seed = MPI.COMM_WORLD, 0
-    fails = comm.rank == comm.size - 1
+    comm = MPI.COMM_WORLD
+    fault = kind if comm.rank == comm.size - 1 else ""
+    record = Run.record
 
     def note() -> None:
         (folder / "fault").write_text(repr(time.time()))
 
-    if fails and kind in ("version", "input"):
+    if fault in ("version", "input"):
         note()
-    if fails and kind == "version":
+    if fault == "version":
         parts.__version__ = "0"
-    if fails and kind == "input":
-        seed = 1
-    from clvoro.adaptation.run import Run
-
-    record = Run.record
 
     def noted(run: Run, progress: float | None = None) -> None:
         record(run, progress)
-        if len(run.rows) == step and fails and kind in ("kill", "error", "full disk"):
+        if len(run.rows) == step and fault in ("kill", "error", "full disk"):
             note()
-            if kind == "kill":
+            if fault == "kill":
                 os.kill(os.getpid(), 9)
-            if kind == "error":
+            if fault == "error":
                 raise OSError("the network is gone")
             resource.setrlimit(resource.RLIMIT_FSIZE, (100, 100))
 
     Run.record = noted  # type: ignore[method-assign]
-    case = folder / f"case{seed}.toml"
-    case.write_text(CASE.format(seed=seed))
+    case = folder / f"case{int(fault == 'input')}.toml"
     out, state = folder / "out", folder / "state"
     options = ["--pieces", "--quiet", "--out", str(out), "--checkpoint", str(state), "--checkpoint-every", "0"]
     sys.exit(command(["run", str(case), *options]))
 
 
 def fail_once(kind: str, step: int, ranks: int) -> dict[str, float]:
-    """Return what one run does after a fault."""
-    mpiexec = shutil.which("mpiexec", path=Path(sys.executable).parent) or "mpiexec"
+    """Run once with a fault; return the time to its end, and its messages and checkpoints."""
     with tempfile.TemporaryDirectory(prefix="clvoro-") as name:
         folder = Path(name)
-        given = [sys.executable, "-W", "ignore", __file__, "--rank", f"{folder}:{kind}:{step}"]
-        environment = {**os.environ, "POCL_MAX_PTHREAD_COUNT": "1"}
+        for seed in (0, 1):
+            (folder / f"case{seed}.toml").write_text(CASE.format(seed=seed))
         try:
-            done = subprocess.run(
-                [mpiexec, "-n", str(ranks), *given], env=environment, capture_output=True, text=True, timeout=LATEST
+            done = run_ranks(
+                ranks, [__file__, "--rank", f"{folder}:{kind}:{step}"], stderr=subprocess.PIPE, timeout=LATEST
             )
         except subprocess.TimeoutExpired:
             return {"hung": 1, "seconds": LATEST, "messages": 0, "there": 0, "damaged": 0}
