@@ -58,11 +58,11 @@ class Adapter:
         Precision on the device.
     comm : mpi4py.MPI.Comm, optional
         Share runs among the ranks of this communicator: all of them create an adapter and call `run` with the same
-        arguments. Each gets a `Result` of its own cells, and ``result.gather()`` returns the whole mesh on rank 0. For
-        boxes with walls, not for "transport", moving meshes, layers and fixed generators. Without `ctx`
+        arguments. Each gets a `Result` of its own cells, and ``result.gather()`` returns the whole mesh on rank 0. The
+        domain is a box with walls; "transport", moving meshes, layers and fixed generators are refused. Without `ctx`
         the ranks of a node take its GPUs in turn.
     share_gpus : bool
-        Whether several ranks may have one GPU, which is refused otherwise.
+        Whether several ranks may have one GPU. Otherwise this raises an `InputError`.
 
     Attributes
     ----------
@@ -217,7 +217,7 @@ class Adapter:
 
         `clvoro.voronoi` uses the adapter that all calls share, on the best device.
 
-        For a `Result`, which has target sizes, too, make a run that takes no step:
+        For a `Result`, which also has target sizes, make a run without steps:
         ``clvoro.adapt(domain, size, points=points, method="lloyd", max_steps=0)``.
 
         Parameters
@@ -416,8 +416,8 @@ class Adapter:
             Generators to start from: those of the array, random ones with density h^-d, or uniform random ones as in
             the paper. From an array, "adaptive" and "exact" only correct and polish a mesh that nearly has the sizes
             already (mean |e| up to 0.15, count off by 2 % at most, cells as good as after a run with this effort), as
-            after the size field has moved by a few cells. From any other array they run all levels; where mean |e| is
-            above 0.6 a random start replaces it, unless `options` has levels.
+            after the size field has moved by a few cells. From any other array they run all levels. If its mean |e| is
+            above 0.6, they begin with a random start instead, unless `options` has levels.
         method : str
             "adaptive" goes from coarse to fine, inserts and deletes generators, and ends with good cells of the right
             size. "exact" gives every cell its target size, to about 1e-4; "transport" to 1e-10 (float32: 1e-3), in a

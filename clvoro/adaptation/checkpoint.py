@@ -5,8 +5,8 @@ velocities, starts of the solvers, weights, the history, and the state of the sc
 action. The run that goes on computes everything else anew from there, and so does the run that is resumed: both have
 the same bits. The size field and the schedule are computed again and compared with the file.
 
-Over ranks each writes its generators to a piece, a file of its own beside the checkpoint. When all pieces are on the
-disk, rank 0 replaces the checkpoint, which names them. Then the pieces of earlier checkpoints are removed.
+Over ranks each rank writes its generators to a file of its own beside the checkpoint, a piece. When all pieces are on
+the disk, rank 0 replaces the checkpoint, which names them. Then the pieces of earlier checkpoints are removed.
 """
 
 from __future__ import annotations
@@ -137,7 +137,7 @@ class Checkpointer:
             self._remove_others({name for name, _ in pieces})
 
     def _write_piece(self, rows: dict[str, np.ndarray]) -> list[tuple[str, int]]:
-        """Write the `rows` of this part; return names and numbers of rows of the pieces of all parts, on the disk."""
+        """Write the `rows` of this part to its piece; return file names and numbers of rows of all pieces."""
         from ..io.arrays import write_arrays
 
         peers = self.peers
@@ -149,7 +149,7 @@ class Checkpointer:
         return list(zip(names, counts, strict=True))
 
     def _remove_others(self, names: set[str]) -> None:
-        """Remove all pieces of this checkpoint's path but those with these `names`."""
+        """Remove the pieces of earlier checkpoints of this path: all but those with these `names`."""
         for path in self.path.parent.iterdir():
             start, end = path.name[: len(self.path.name)], path.name[len(self.path.name) :]
             if start == self.path.name and re.fullmatch(r"\.[0-9a-f]{16}\.[0-9]+", end) and path.name not in names:
@@ -163,14 +163,14 @@ class Saved:
     ----------
     path : str or path
     peers : Peers
-        The parts of the run that goes on: each takes its share of the generators.
+        The parts of the resumed run. Each takes its share of the generators.
 
     Attributes
     ----------
     levels : int
         Number of coarser levels of the run.
     given : GivenPoints
-        What the run makes of the points of the caller.
+        How the run uses the points that the caller has given.
 
     Raises
     ------
@@ -207,9 +207,9 @@ class Saved:
             raise self._damaged(error) from error
 
     def _take_rows(self, pieces: list[tuple[str, int]]) -> None:
-        """Read the generators of this part from the `pieces`, names and numbers of rows, or take them from the file.
+        """Keep the generators of this part, from the `pieces` (file name, number of rows) or else from the checkpoint.
 
-        As many parts as pieces have the same generators as before.
+        If there are as many parts as pieces, each part gets the generators of its piece; otherwise equal shares.
         """
         from ..io.arrays import read_arrays
 

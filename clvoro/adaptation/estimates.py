@@ -21,9 +21,9 @@ from .sampling.quadrature import DensityTree
 MAX_CELLS = 100_000_000
 """Limit of the 32-bit indices into rows of neighbors."""
 MAX_LABELS = 2_000_000_000
-"""Limit of the permanent numbers of generators, which parts share."""
+"""Limit of the permanent numbers of generators, which are unique among all parts."""
 GHOST_LAYERS = {2: 2.8, 3: 2.2}
-"""Depth of the ghosts around a part over the size of cells; see `clvoro.tessellation.part_steps`."""
+"""Depth of the layer of ghosts around a part over the size of cells; see `clvoro.tessellation.part_steps`."""
 SIZES = {
     "plane": {"run": (26, 86), "diagram": (65, 45), "power run": (74, 119), "power diagram": (75, 92)},
     "cut": {"run": (68, 79), "diagram": (94, 90), "power run": (171, 134), "power diagram": (125, 130)},
@@ -97,7 +97,7 @@ def estimate_memory(
     """Return the largest device memory of a run of `n` cells, or of reading its diagram, in bytes.
 
     Without `run`, return that of `Adapter.diagram`. With `power`, the run ends with a power diagram, or the diagram is
-    one. With `exact`, meshes are made during the run if walls are curved.
+    one. With `exact` and curved walls, a run also makes diagrams between its steps.
     """
     extras = Extras() if extras is None else extras
     traits = engine.traits
@@ -128,9 +128,9 @@ def estimate_memory(
 
 
 def cells_of_part(n: float, dim: int, parts: int) -> float:
-    """Return the cells and ghosts of the largest of several `parts` with `n` cells in all.
+    """Return how many cells and ghosts the largest of several `parts` of a mesh of `n` cells has.
 
-    Ghosts are a shell around a cube of cells, as deep as the balls that parts first ask for.
+    The part is taken as a cube of cells, and its ghosts as a shell around it of depth `GHOST_LAYERS`.
     """
     own = UNBALANCED * n / parts
     return float(min((own ** (1 / dim) + 2 * GHOST_LAYERS[dim]) ** dim, n))
@@ -148,7 +148,7 @@ def check_memory(
 ) -> float:
     """Check that the device has memory for `n` cells, and return the bytes needed (see `estimate_memory`).
 
-    Where parts share a run, these are the bytes of the largest part, with its ghosts.
+    If parts share the run, these are the bytes of the largest part with its ghosts.
 
     Raises
     ------

@@ -50,7 +50,7 @@ class ResultParts:
         self.engine.peers.agree(work)
 
     def owners(self) -> np.ndarray:
-        """Return the part of each cell of the whole mesh, (n,) int, on part 0, and nothing on the others."""
+        """Return on part 0 which part owns each cell of the whole mesh, (n,) int; on others an empty array."""
         labels = self.engine.peers.collect(self.labels)
         parts = np.repeat(np.arange(len(labels)), [len(own) for own in labels])
         return parts[np.argsort(np.concatenate([np.empty(0, np.int32), *labels]), kind="stable")]

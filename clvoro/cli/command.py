@@ -97,7 +97,7 @@ def _add_run(commands: Any) -> None:
 
 def _add_settings(run: Any) -> None:
     run.add_argument("--device", metavar="NAME", help="gpu, cpu, part of a name, or PLATFORM:DEVICE indices")
-    run.add_argument("--share-gpus", action="store_true", help="under mpiexec: let several ranks have one GPU")
+    run.add_argument("--share-gpus", action="store_true", help="under mpiexec: let several ranks use one GPU")
     run.add_argument(
         "--method",
         metavar="M",
@@ -146,8 +146,8 @@ def _add_output(run: Any) -> None:
     run.add_argument(
         "--pieces",
         action="store_true",
-        help="under mpiexec: each rank writes its own cells, mesh.pvtu in place of mesh.vtu and mesh.npz, and no "
-        "report; no rank holds the whole mesh, but for --format openfoam",
+        help="under mpiexec: each rank writes its own cells, as mesh.pvtu in place of mesh.vtu, mesh.npz and the "
+        "report; only --format openfoam gathers the whole mesh on rank 0",
     )
     _add_types(run)
     _add_walls(run)
@@ -386,13 +386,13 @@ def _carry_out(argv: Sequence[str] | None) -> int:
 
 @contextmanager
 def _silence() -> Iterator[None]:
-    """Discard what is printed: another rank says the same."""
+    """Discard what is printed, since rank 0 prints the same."""
     with open(os.devnull, "w", encoding="utf-8") as nowhere, redirect_stdout(nowhere), redirect_stderr(nowhere):
         yield
 
 
 def _explain(error: BaseException) -> tuple[object, int]:
-    """Return what to print about `error`, and the exit code; raise it if it is an error in clvoro itself."""
+    """Return the message for `error` and the exit code. Raise an error again that shows a fault of clvoro."""
     if isinstance(error, KeyboardInterrupt | Aborted):
         return "interrupted, nothing more has been written", INTERRUPTED
     if isinstance(error, MemoryError) and not isinstance(error, ClvoroError):
@@ -409,7 +409,7 @@ _CODES: tuple[tuple[tuple[type[BaseException], ...], int], ...] = (
     ((DeviceError,), NO_DEVICE),
     ((ClvoroError, OSError), FAILED),
 )
-"""Exit codes by the kind of an error; the first one that fits counts."""
+"""Classes of errors and their exit code; the first row that has the class of an error counts."""
 
 
 def _warning_printer() -> Callable[..., None]:

@@ -86,13 +86,13 @@ class Job:
     solver : "openfoam" or None
         Check the mesh by the criteria of this solver, and with its own program if that is installed.
     processors : int or None
-        Write a decomposed case for OpenFOAM, too, for so many processors.
+        Also write a decomposed case for OpenFOAM with this number of processors.
     peers : Peers
-        The ranks of `mpiexec` that share the run: all of them have the same job. Rank 0 gathers the mesh and writes.
+        The ranks that share the run under `mpiexec`. Each has the same job; rank 0 gathers the mesh and writes it.
     pieces : bool
-        Each rank writes its own cells instead.
+        Each rank writes its own cells, and rank 0 does not gather the mesh.
     share_gpus : bool
-        Whether ranks may have one GPU.
+        Whether several ranks may have one GPU.
     """
 
     case: Case
@@ -171,7 +171,7 @@ class Job:
         return self.interrupted
 
     def _prepare(self) -> tuple[Any, dict[str, Any], Checkpoint | None]:
-        """Check all that can be known before the run; return the size field, the arguments and the checkpoint."""
+        """Check all that can be checked before the run; return the size field, the arguments and the checkpoint."""
         arguments = self.case.run_arguments()
         size = self._during("preparing the size field", self.case.size_field)
         warn_of_unused(self.case.run, [m or Options.method for m in self.case.methods])
@@ -199,7 +199,7 @@ class Job:
         return Adapter(context, dtype, self.peers, self.share_gpus)
 
     def _refuse_pieces(self) -> None:
-        """Raise an error before the run if ranks cannot share it, or cannot write its files in pieces."""
+        """Raise an error if ranks cannot share the run, or if its files cannot be written in pieces."""
         if self.peers.count == 1:
             if self.pieces:
                 raise InputError(
@@ -366,7 +366,7 @@ class Job:
         return f"mesh-{other}{Path(self._mesh_files[-1]).suffix}"
 
     def _write(self, adapter: Any, size: Any, results: dict[str, Result], where: str) -> None:
-        """Write all files: on rank 0, or in pieces on all of them."""
+        """Write all files on rank 0; with `pieces` each rank writes its cells."""
         if self.peers.number and not self.pieces:
             return
         *others, (_, main) = results.items()
@@ -384,7 +384,7 @@ class Job:
             work = "solver mesh" if kind == "openfoam" else name
             tasks.append(partial(self._during, f"writing the {work}", task))
         tasks += [partial(save, result, self.out / self._mesh_file_of(other)) for other, result in others]
-        if self.peers.number:  # the other files are of rank 0
+        if self.peers.number:  # rank 0 writes all other files
             do_all(tasks)
             return
         tasks.append(partial(write_history, main, self.out / "history.csv"))

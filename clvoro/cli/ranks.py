@@ -1,4 +1,4 @@
-"""A command that `mpiexec` has started as several processes: which of them this is, one message, and one exit code."""
+"""Commands under `mpiexec`: the rank of this process, and how all ranks end with one message and one exit code."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ def _set_in_environment(names: tuple[str, ...], default: int) -> int:
 
 
 def may_speak() -> bool:
-    """Return whether this process is the first one that `mpiexec` has started, or was not started by it."""
+    """Return whether this process may print: under `mpiexec` only rank 0 does."""
     return _set_in_environment(_NUMBERS, 0) == 0
 
 
 def this_rank() -> Peers:
-    """Return the ranks of this command as this process sees them: alone without `mpiexec`.
+    """Return the ranks that share this command; `ALONE` without `mpiexec`.
 
     MPI is loaded only if `mpiexec`, or ``python -m mpi4py``, has started the process.
 
@@ -56,9 +56,10 @@ def this_rank() -> Peers:
 
 
 def end_together(peers: Peers, code: int, show: Callable[[], object]) -> int:
-    """Return the exit code of all ranks, after one of them has failed with `code`; one rank calls `show`.
+    """Return one exit code for all ranks, after an error for which this one would end with `code`.
 
-    That is rank 0. If it does not answer, the others speak for themselves, and end all processes.
+    Rank 0 calls `show`, which prints the message, and its code counts. A rank that does not hear from rank 0 calls
+    `show` itself and ends all processes.
     """
     if peers.number == 0:
         show()
