@@ -6,7 +6,7 @@ Balls around lines and creases keep the others away.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -40,6 +40,8 @@ class FixedGenerators:
         The balls of generator i are ``balls[ball_starts[i]:ball_starts[i + 1]]``.
     left_out : (k, d) float64
         Places on lines or creases without room for generators.
+    n_sized : int
+        How many of the last generators have cells that keep their size, as their target size.
     """
 
     points: np.ndarray
@@ -48,17 +50,13 @@ class FixedGenerators:
     ball_starts: np.ndarray
     balls: np.ndarray
     left_out: np.ndarray
+    n_sized: int = field(default=0, kw_only=True)
 
     least_cells = 0
     """Least number of cells of a mesh for each of them."""
 
     def __len__(self) -> int:
         return len(self.points)
-
-    @property
-    def n_sized(self) -> int:
-        """How many of the last generators have cells that keep their size, as their target size."""
-        return 0
 
     def with_others(self, others: FixedGenerators | None, room: Callable[[np.ndarray], np.ndarray]) -> FixedGenerators:
         """Return these generators, and those of `others` that are farther than room(points) from all of these."""
@@ -75,6 +73,7 @@ class FixedGenerators:
             np.concatenate([self.ball_starts, ends]).astype(np.int32),
             np.concatenate([self.balls, *(balls + len(self.centers) for balls in lists)]).astype(np.int32),
             np.concatenate([self.left_out, others.left_out]),
+            n_sized=int((kept >= len(others) - others.n_sized).sum()),
         )
 
 

@@ -58,11 +58,6 @@ class LinePairs(FixedGenerators):
     chords: np.ndarray
     sizes: np.ndarray
 
-    @property
-    def n_sized(self) -> int:
-        """The number of all generators: each cell keeps its size."""
-        return len(self)
-
 
 class _Piece(NamedTuple):
     """A part of a line without a corner: its vertices, the lengths up to each of them, and the nodes at both ends."""
@@ -170,6 +165,7 @@ def place_pairs(domain: Domain, network: Network, size: Callable[[np.ndarray], n
         np.reshape(placing.dropped, (-1, 2)),
         np.reshape(layout.chords, (-1, 2, 2)),
         np.array(layout.sizes),
+        n_sized=len(layout.points),
     )
 
 

@@ -61,18 +61,10 @@ class Stations(FixedGenerators):
         The size h of their cells.
     chain : (n,) int
         The chain that each one belongs to; -1 for those that complete a corner.
-    n_own : int
-        How many have cells whose target size is the size that they have: the last ones.
     """
 
     size: np.ndarray
     chain: np.ndarray
-    n_own: int
-
-    @property
-    def n_sized(self) -> int:
-        """Number of the last generators whose cells have as target size the size that they have."""
-        return self.n_own
 
 
 @dataclass(frozen=True)
@@ -531,7 +523,7 @@ class AroundCreases:
             self.lost,
             self.sizes,
             self.chains,
-            int(self.sized.sum()),
+            n_sized=int(self.sized.sum()),
         )
 
 

@@ -7,6 +7,7 @@ from scipy.spatial import KDTree
 from clvoro import Polygon, Solid
 from clvoro.adaptation.fixed_points import place_in_corners
 from clvoro.errors import MismatchWarning
+from clvoro.geometry.fixed_generators import FixedGenerators
 from clvoro.geometry.solid.stations import chain_line
 
 L = Solid.extruded(Polygon([(0, 0), (2, 0), (2, 1), (1, 1), (1, 2), (0, 2)]), 0, 1)
@@ -88,6 +89,10 @@ def test_generators_come_nearer_to_creases_where_there_is_little_room():
     assert stations.size[: -stations.n_sized] == pytest.approx(h, rel=0.3)
     assert (stations.size[-stations.n_sized :] < 0.81 * h).all()
     assert (KDTree(stations.points).query(stations.centers)[0] > 0.9 * stations.radii).all()
+    # Without the last one, which is too near to another generator, the others that have their own sizes remain.
+    none = np.empty(0, np.int32)
+    other = FixedGenerators(stations.points[-1:], np.empty((0, 3)), none, np.zeros(2, np.int32), none, np.empty((0, 3)))
+    assert other.with_others(stations, lambda x: np.full(len(x), 1e-3)).n_sized == stations.n_sized - 1
 
 
 def test_cells_around_narrow_curves_have_their_own_sizes():
