@@ -129,7 +129,7 @@ class Engine:
         self.workspace = Workspace(queue) if workspace is None else workspace
         self.pool = KernelPool() if pool is None else pool
         self.peers = peers
-        self._shared_kernels: dict[str, Kernels] = {}
+        self._shared_kernels: dict[object, Kernels] = {}
 
     def replaced(self, *, real: np.dtype | None = None, traits: Traits | None = None) -> Engine:
         """Return an engine of another precision or other traits that shares workspace and kernels with this one."""
@@ -208,12 +208,13 @@ class Engine:
         group_size : int, optional
             Work-items per group of block-wise kernels, by default the engine's.
         shared : bool
-            Return the same kernels in each call for `stage`, for launches that set all arguments.
+            Return the same kernels in each call with this `stage` and these `defines`. Launches must set all arguments.
         """
         if shared:
-            if stage not in self._shared_kernels:
-                self._shared_kernels[stage] = self.kernels(stage, defines, prelude, group_size)
-            return self._shared_kernels[stage]
+            key = stage, frozenset((defines or {}).items())
+            if key not in self._shared_kernels:
+                self._shared_kernels[key] = self.kernels(stage, defines, prelude, group_size)
+            return self._shared_kernels[key]
         name, full = f"{stage}.cl", self.all_defines(stage, defines or {})
         # Called through the module, because tests replace the function.
         return Kernels(

@@ -79,7 +79,7 @@ class Ghosts:
     def of_lists(
         cls, engine: Engine, peers: Peers, parts: np.ndarray, rows: np.ndarray, sent: Sequence[np.ndarray]
     ) -> Ghosts:
-        """Return the same, if this part knows already which of its rows each of the parts needs: `sent`."""
+        """Return the same ghosts. This part knows already which of its rows each part needs: `sent`."""
         sizes, counts = np.array([len(needed) for needed in sent]), np.bincount(parts, minlength=peers.count)
         needed = engine.upload(np.concatenate(sent), np.int32)
         return cls(engine.upload(rows, np.int32), None, None, peers, parts, needed, sizes, counts)
@@ -98,10 +98,9 @@ class Ghosts:
         columns = [(np.int32(width), np.int32(row), np.int32(sum(words[:k]))) for k, width in enumerate(words)]
         with engine.workspace.frame():
             packed, given = np.empty((s, row), np.uint32), engine.scratch(s * row, np.uint32)
-            for array, which in zip(values, columns, strict=True):
-                if s:
-                    engine.run_each(kernels.pack_rows, s, self.sent, array, *which, given)
             if s:
+                for array, which in zip(values, columns, strict=True):
+                    engine.run_each(kernels.pack_rows, s, self.sent, array, *which, given)
                 cl.enqueue_copy(engine.queue, packed, buffer_of(given))
             received = np.empty((g, row), np.uint32)
             self.peers.swap(packed, np.asarray(self.sent_counts), received, np.asarray(self.counts))
@@ -178,7 +177,7 @@ class Part:
         given = (t.starts, t.neighbors, self.labels, t.sites, *self.box.clip_args(engine), *t.vertices[:1])
         reach = engine.scratch(t.n, np.float32) if t.reach is None else t.reach
         measures = t.face_measures, t.face_centroids, t.volumes, t.offsets, t.covariances, reach
-        order = engine.kernels("tessellation/row_order", defines).order_rows
+        order = engine.kernels("tessellation/row_order", defines, shared=True).order_rows
         engine.run_each(order, t.n, *given, *measures, *(engine.period_args if t.vertices else ()))
 
     def measure_faces(self, engine: Engine, t: Tessellation, defines: dict[str, object]) -> Tessellation:
@@ -190,10 +189,8 @@ class Part:
 
     def mark_neighbors(self, engine: Engine, t: Tessellation, marks: cla.Array) -> None:
         """Set `marks` (count,) int32 to 1 for ghosts that are neighbors of own generators in `t`, else to 0."""
-        marks.fill(0)
-        engine.run_each(
-            engine.kernels("tessellation/part", shared=True).mark_ghosts, self.n_own, t.starts, t.neighbors, marks
-        )
+        kernel = engine.kernels("tessellation/part", shared=True).mark_ghosts
+        engine.run_each(kernel, self.n_own, t.starts, t.neighbors, marks.fill(0))
 
     def sums(
         self,
@@ -213,32 +210,27 @@ class Part:
         marks : (count,) int32
             1 for ghosts whose cells must be final.
         rows : int
-            Number of rows of which cells must be final: own ones, and marked ghosts among the others.
+            Of the first `rows` generators and ghosts the cells must be final, of ghosts only where `marks` is 1.
         reach : (rows,) float32
             See `Tessellation`.
         at, limits : (count, d) real, (count, 2) float32
-            For each row an earlier position, a radius within which all generators are known there, and how far the
-            generator may move from there.
+            Of each generator and ghost an earlier position, the radius around it within which all generators are known,
+            and how far the generator may move from it.
         needed : float
-            Radius of the ball that must be known, over the reach.
+            Radius of the ball in which all generators must be known, over the reach.
 
         Returns
         -------
         (4,) ndarray
-            Volume of own cells. Of their faces with ghosts the signed sum, and the sum of measures: the signed sums of
-            all parts add up to zero if each face between two parts has both sides. Number of rows beyond their limits.
+            The volume of own cells; the signed sum of the measures of their faces with ghosts; the sum without signs;
+            the number of generators and ghosts beyond their limits. The signed sums of all parts add up to zero if each
+            face between two parts has both sides.
         """
         sums = engine.scratch((SUMS, 4))
         given = t.starts, t.neighbors, self.labels, t.face_measures, t.volumes
         limited = marks, np.int32(rows), reach, self.points, at, limits, engine.real.type(needed)
-        engine.run_each(
-            engine.kernels("tessellation/part", shared=True).sum_cells,
-            SUMS,
-            np.int32(self.n_own),
-            *given,
-            *limited,
-            sums,
-        )
+        kernel = engine.kernels("tessellation/part", shared=True).sum_cells
+        engine.run_each(kernel, SUMS, np.int32(self.n_own), *given, *limited, sums)
         return sums.get().sum(axis=0, dtype=float)
 
     def forward(self, engine: Engine, *values: cla.Array) -> None:
