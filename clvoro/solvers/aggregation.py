@@ -73,7 +73,7 @@ class Aggregates:
     Attributes
     ----------
     aggregate : (n or more,) int32
-        Number of each cell's aggregate, and of those of other parts.
+        Number of the aggregate of each cell, then of each cell of other parts.
     starts : (aggregates + 1,) int32
     members : (n,) int32
         Aggregate g has the cells ``members[starts[g]:starts[g + 1]]``.
@@ -260,9 +260,10 @@ class Aggregation:
         return inverse, Aggregates(aggregate, starts[: count + 1], members, ghosts)
 
     def _ghosts_of(self, fine: Ghosts, n: int, count: int, aggregate: cla.Array) -> Ghosts:
-        """Return who owns the aggregates of the ghosts `fine`, and number these in `aggregate`, from `count` on.
+        """Return the ghosts of the coarse graph, the aggregates of `fine`. Number them in `aggregate`, from `count` on.
 
-        The owners have sent the numbers that aggregates have there. Both sides list them in ascending order.
+        The owners send the numbers that the aggregates have in their parts. Owner and receiver both list the aggregates
+        in ascending order of these numbers, so they agree without further messages.
         """
         engine, peers = self.engine, self.engine.peers
         fine.fill(engine, n, aggregate)

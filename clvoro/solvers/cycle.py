@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import pyopencl as cl
@@ -81,7 +82,7 @@ class Cycle:
     ) -> None:
         """Use these levels, the finest first. `factor` is the factorized coarsest level, if it is solved exactly.
 
-        With other parts `rest` (b, x) solves on the level after these, x = M^-1 b.
+        Over several parts `rest` (b, x) sets x = M^-1 b on the level that follows these.
         """
         self._levels, self._factor, self._rest = levels, factor, rest
         self._key: list[object] | None = None
@@ -94,10 +95,7 @@ class Cycle:
             self._set_launches(r, u, work)
             self._key = key
         for launch in self._launches:
-            if callable(launch):
-                launch()
-            else:
-                self.engine.enqueue(*launch)
+            launch()
 
     def _set_launches(self, r: cla.Array, u: cla.Array, work: cla.Array | None) -> None:
         levels = self._levels
@@ -115,7 +113,7 @@ class Cycle:
             self._descend(depth, None if depth or in_place else r)
         if self._rest is not None:
             rest, (b, x, *_) = self._rest, self._vectors[-1]
-            self._launches.append(lambda: rest(b, x))
+            self._launches.append(partial(rest, b, x))
         elif count < len(levels):
             self._solve_coarse(count, *(None, None) if count or in_place else (r, u))
         for depth in reversed(range(count)):
@@ -149,7 +147,7 @@ class Cycle:
             whole = group = self.engine.block_of(kernel)
         else:
             whole, group = round_to_work_group(size), fit_group(kernel, WORK_GROUP)
-        self._launches.append((kernel, whole, group))
+        self._launches.append(partial(self.engine.enqueue, kernel, whole, group))
 
     def _descend(self, depth: int, r: cla.Array | None) -> None:
         """Smooth from zero and restrict the defect. The right side is rounded from `r`, if given."""
@@ -174,11 +172,10 @@ class Cycle:
             self._add(depth, "restrict_defect", count, t, *lists)
 
     def _compute_defect(self, depth: int) -> None:
-        """Set t = b - A x. Other parts send their values of x before."""
-        graph, (b, x, t), engine = self._levels[depth].graph, self._vectors[depth], self.engine
+        """Set t = b - A x, after other parts have sent the values of x of their cells."""
+        graph, (b, x, t) = self._levels[depth].graph, self._vectors[depth]
         if graph.ghosts is not None:
-            ghosts, n = graph.ghosts, len(graph)
-            self._launches.append(lambda: ghosts.fill(engine, n, x))
+            self._launches.append(partial(graph.ghosts.fill, self.engine, len(graph), x))
         self._add(depth, "compute_defect", len(graph), *graph.rows, b, x, t)
 
     def _solve_coarse(self, depth: int, r: cla.Array | None, u: cla.Array | None) -> None:

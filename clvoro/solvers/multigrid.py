@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 _COARSEST = 64
 """Cells of the coarsest level, at most, if it is solved exactly."""
 GATHERED = 5000
-"""Cells of a level of all parts from which on each part has the whole level, and does the same as the others."""
+"""A level of at most so many cells, over all parts, is gathered: each part has it whole, and all do the same work."""
 _MAX_LEVELS = 30
 _LEAST_COARSENING = 0.8
 """Ratio of the cells of two levels above which coarsening ends."""
@@ -47,8 +47,8 @@ class Multigrid:
     within [0, 1], and C is positive semidefinite, however much it overshoots. A level visited twice, 2 C - C A C, is
     not: with scaled weights C A can exceed 2 where weights vary strongly. Hence the V-cycle.
 
-    With other parts aggregates have cells of one part, and each step of a smoother needs values of the others. Levels
-    of at most `GATHERED` cells are gathered: each part does the rest of the cycle for all.
+    Over several parts each aggregate has cells of one part, and each smoothing step needs values of the others. From
+    the first level of at most `GATHERED` cells on, each part has the whole levels and does the same work there.
 
     Parameters
     ----------
@@ -117,7 +117,7 @@ class Multigrid:
         self._cycle.set_levels(self._levels, self._factor, rest)
 
     def _gather(self, graph: Graph, sizes: np.ndarray) -> Callable[[cla.Array, cla.Array], None]:
-        """Set up the levels from `graph` on for the cells of all parts, `sizes` (p,), and return what solves there."""
+        """Set up the levels from `graph` on with the cells of all parts, `sizes` (p,). Return what sets x = M^-1 b."""
         peers, n, firsts = self.engine.peers, len(graph), np.cumsum(sizes) - sizes
         assert graph.ghosts is not None
         starts, first = graph.starts.get(), int(firsts[peers.number])
@@ -134,10 +134,11 @@ class Multigrid:
             engine.upload(columns, np.int32),
             engine.upload(weights, np.float32),
         )
-        b_of_all, x_of_all, work = (engine.empty(int(sizes.sum()), np.float32) for _ in range(3))
+        b_of_all, x_of_all, work = (self._room("whole", name, size=int(sizes.sum())) for name in "bxt")
 
         def solve(b: cla.Array, x: cla.Array) -> None:
-            b_of_all.set(np.concatenate(peers.exchange([b.get()[:n]] * peers.count, sizes)))
+            own = b.get().astype(np.float32)
+            b_of_all.set(np.concatenate(peers.exchange([own] * peers.count, sizes)))
             whole.apply(b_of_all, x_of_all, work)
             if n:
                 cl.enqueue_copy(engine.queue, buffer_of(x), buffer_of(x_of_all), byte_count=4 * n, src_offset=4 * first)
@@ -184,10 +185,8 @@ class Multigrid:
             Overwritten.
         """
         if self._rest is not None and not self._levels:
-            single = self._room("b", size=len(r))
-            single.set(r.get().astype(np.float32))
             x = self._room("x", size=len(r))
-            self._rest(single, x)
+            self._rest(r, x)
             u.set(x.get().astype(u.dtype))
             return
         self._cycle.enqueue(r, u, work)
