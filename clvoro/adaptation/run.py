@@ -130,7 +130,6 @@ class Run:
         self._fixed = check_fixed(fixed, domain, stages.engine.real)
         self._files, self._callback, self._on_memory, self._alone = files, callback, on_memory, alone
         self._is_part = stages.engine.peers.count > 1
-        self._keeps_displacements = not self._is_part  # generators change their part before the end
         peers, source = stages.engine.peers, files.source
         self._begin(size, given, saved=None if source is None else peers.agree(lambda: Saved(source, peers)))
 
@@ -163,7 +162,9 @@ class Run:
             lambda: prepare(stages, self._domain, size, used, options, max_levels, self._fixed),
             lambda made: {
                 **run_fingerprint(self._domain, vars(options), stages.engine.real, used, self._fixed),
-                **{"cells": made.target, "levels": made.levels, "cells for the size field": made.required},
+                "cells": made.target,
+                "levels": made.levels,
+                "cells for the size field": made.required,
             },
         )
         if hasattr(self, "state"):
@@ -364,7 +365,7 @@ class Run:
                 while self._advance():
                     pass
             except KeyboardInterrupt:
-                if self._is_part:  # the other parts wait somewhere
+                if self._is_part:  # the other parts wait for this one
                     raise
                 self.stop_reason = INTERRUPTED
                 # Of a step that has not ended the generators are good: the run that is resumed does it again.
@@ -384,10 +385,10 @@ class Run:
         return self.n_cells if self.level == 0 else None
 
     def note(self, displacement: Displacement) -> None:
-        """Keep the displacement of the first and of the last step on the host."""
-        if self._keeps_displacements and self.initial is None:
+        """Keep the displacement of the first and of the last step on the host. Parts swap generators, and keep none."""
+        if not self._is_part and self.initial is None:
             self.initial = self.state.displacements(displacement)
-        if self._keeps_displacements and self.position == self._last_step:
+        if not self._is_part and self.position == self._last_step:
             self.final = self.state.displacements(displacement)
         self.solution = displacement.solution
 
@@ -499,11 +500,7 @@ class Run:
     def _read_result(self) -> Result:
         """Read the mesh. Raises InputError if cells of nearly coincident generators are wrong because of round-off."""
         mesh, final = self.state, self.final
-        if (
-            self._keeps_displacements
-            and self.steps
-            and (final is None or self.rows[-1]["step"] == self.rows[-2]["step"])
-        ):
+        if not self._is_part and self.steps and (final is None or self.rows[-1]["step"] == self.rows[-2]["step"]):
             # The last step was not known in advance, or generators have changed since.
             assert self.last is not None
             with mesh.engine.workspace.frame():
