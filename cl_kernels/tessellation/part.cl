@@ -28,9 +28,9 @@ inline REAL weight_of_face(int a, int b)
     return 1 + (REAL)(h >> 16) / 65536;
 }
 
-/* Whether all generators are known in the ball around generator i with the radius needed * reach[i], and whether no
-   other part needs to know it that does not. At the position at[i] all are known within limits[i].s0, and other parts
-   know the generator or have no ball nearer than limits[i].s1. */
+/* Whether this part knows all generators in the ball around generator i with the radius needed * reach[i], and whether
+   generator i is outside of the balls of all parts that do not know it. When the generator was at at[i], this part knew
+   all generators within limits[i].s0 of it, and it was at least limits[i].s1 away from those balls of other parts. */
 inline bool is_within_limits(int i, REAL needed, global const float *reach, global const REAL *points,
                              global const REAL *at, global const float2 *limits)
 {
@@ -44,9 +44,9 @@ inline bool is_within_limits(int i, REAL needed, global const float *reach, glob
 }
 
 /* sums[4 t ...] = the volumes of the generators t, t + size, ... of n; the weighted measures of their faces with
-   ghosts, positive in the cell of the lower label; those without signs; and the number of rows t, t + size, ..., of
-   ghosts only marked ones, that are not within their limits. Over all parts the second sum is zero if each face has
-   both sides. One work-item per t. */
+   ghosts, positive in the cell of the lower label; those without signs; and how many of the first `rows` generators and
+   marked ghosts, again t, t + size, ..., are beyond their limits. Over all parts the second sum is zero if each face
+   has both sides. One work-item per t. */
 kernel void sum_cells(const int size, const int n, global const int *starts, global const int *neighbors,
                       global const int *labels, global const FACE *face_measures, global const REAL *volumes,
                       global const int *marks, const int rows, global const float *reach, global const REAL *points,

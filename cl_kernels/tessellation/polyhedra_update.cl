@@ -22,7 +22,8 @@
    period. Then any two generators about a vertex are less than half a period apart, and all their cells see the same
    images there. Cells without gap or overlap may cover the box more than once; the host compares the volumes.
 
-   In a part of a domain ghosts have no cells. Cells beside them are clipped, and never wrong. */
+   In a part of a domain ghosts have no cells with which faces could be compared. So cells beside them are always
+   clipped by all generators near them. */
 
 /* Largest difference of the areas of two half-faces, as a share of the area of the cell, where one is from a cell that
    was clipped. */

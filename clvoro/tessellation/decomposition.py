@@ -11,7 +11,7 @@ from ..opencl.peers import Peers
 BITS = 20
 """Bits of a coordinate in the keys of the Hilbert curve."""
 BLOCKS = 1024
-"""A block has at most one generator in so many, unless many are at one place."""
+"""A block has at most this fraction of the generators, 1 / `BLOCKS`, unless many are at one place."""
 UNBALANCED = 1.1
 """Generators are divided anew if the largest part has more than so many times the mean."""
 
@@ -19,7 +19,7 @@ UNBALANCED = 1.1
 def hilbert_keys(points: np.ndarray, lower: np.ndarray, upper: np.ndarray, bits: int = BITS) -> np.ndarray:
     """Return the places along a Hilbert curve of `points` (n, d) in the box between two corners, (n,) uint64.
 
-    Coordinates are rounded to so many `bits`.
+    Keys have this number of `bits` of each coordinate.
 
     The transformation is that of Skilling (2004), AIP Conf. Proc. 707, 381.
     """

@@ -201,11 +201,11 @@ class Tessellation:
             self.part.forward(engine, *values)
 
     def with_ghosts(self, engine: Engine, *values: cla.Array) -> list[cla.Array]:
-        """Return each of `values` (n, ...) and behind it that of ghosts, in the workspace; as it is without ghosts."""
+        """Return each of `values` (n, ...) followed by those of ghosts, in the workspace; without ghosts, `values`."""
         return list(values) if self.part is None else self.part.with_ghosts(engine, *values)
 
     def names(self, engine: Engine, labels: cla.Array) -> cla.Array:
-        """Return `labels` (n,) int32 of the generators, and behind them those of ghosts."""
+        """Return `labels` (n,) int32 of the generators, followed by those of ghosts."""
         known = None if self.part is None else self.part.labels
         return self.with_ghosts(engine, labels)[0] if known is None else known
 

@@ -1,14 +1,14 @@
 """The steps of a part of a domain: generators of other parts as ghosts, and the proof that there are enough of them.
 
-A ball around a corner of a cell, with the generator of the cell on its surface, contains no generator. The reach of a
-cell is the distance of its farthest corner from its generator, and all these balls lie in the ball around the generator
-with twice this radius. So a cell is final if this part knows all generators in that ball.
+The ball around a corner of a cell, with the generator of the cell on its surface, contains no other generator. The
+reach of a cell is the distance of its farthest corner from its generator. The ball around the generator with twice this
+radius contains the balls of all corners. So a cell is final if this part knows all generators in that ball.
 
 Each part tells the others the boxes around its generators, and asks those whose boxes meet its balls for the generators
-inside. It asks for balls that are larger than necessary. So ghosts remain enough for some steps: as long as no ball has
-become larger than the one of the last request, and no generator has moved so far that it may have come into a ball of a
-part that does not know it (`sum_cells` in part.cl). Only then parts ask again. If there are new ghosts, all parts make
-their cells again.
+inside. It asks for balls that are larger than necessary. So the ghosts are enough for some steps. The parts ask again
+only when a ball has become larger than the one of the last request, or when a generator has moved so far that it may be
+in a ball of a part that does not know it (`sum_cells` in part.cl). If there are new ghosts, all parts make their cells
+again.
 """
 
 from __future__ import annotations
@@ -34,32 +34,34 @@ from .stages import TessellationStages
 from .steps import DomainSteps, Sort
 
 FIRST_REACH = 1.9, 2.4
-"""Radius of the first balls over the spacing of the generators around: if only own cells have to be final, and if those
-of their neighbors have to be final, too."""
+"""Radius of the first balls over the spacing of the generators around. The first number holds where only own cells must
+be final (3D), the second where the cells of neighboring ghosts must be final, too (2D)."""
 ROUGH = 12
-"""Bits of the coordinates that order generators within a part."""
+"""Bits of a coordinate in the Hilbert keys that order the generators of a part."""
 JUMP = 8
-"""A new box begins where two successive generators on the curve are so many spacings apart."""
+"""A new chunk begins where two successive generators on the curve are more than so many spacings apart."""
 GROWTH, SKIN = 1.15, 0.15
-"""Radius of the balls that a part asks for, over that of the balls that its cells need. How far any other generator
-may come nearer before one may be in a ball without being known, as a share of this radius."""
+"""Radius of the balls of a part, over that of the balls that its cells need. Width of the skin around each ball, as a
+share of this radius: a part asks for the generators in the skin, too, because they may move into the ball."""
 NEAR, FREE = 1.6, 0.8
-"""Where generators of other parts are more than so many radii of the largest ball away, only boxes are compared. Radius
-of a ball far from all others over their distance."""
+"""A group of balls that is farther from the generators of another part than so many radii of the largest ball is
+compared as a whole. Radius around a generator in which all others are known, over its distance from other parts."""
 NOISE = {"float64": 1e-6, "float32": 1e-4}
 """Bound of the round-off of a reach, as a share of it."""
 FILLED, MATCHED = {"float64": 1e-8, "float32": 1e-3}, {"float64": 1e-5, "float32": 1e-3}
-"""Largest differences of the volume of all cells from that of the domain, and of both sides of faces between parts."""
+"""Largest relative differences between the volume of all cells and that of the domain, and between the measures of both
+sides of the faces between parts."""
 MOST_GHOSTS = 0.5
-"""Number of ghosts over that of own generators from which on cells in 3D are built anew: too many are beside ghosts."""
+"""In 3D cells are built anew, and not updated, if there are more ghosts than this share of the own generators: too many
+cells are beside ghosts."""
 GROUP = 64
-"""Number of balls around ghosts in a box."""
+"""Number of balls in a group, if they are around ghosts or another part has sent them."""
 FAILED = np.array([0.0, 0.0, 0.0, 0.0, 1.0])
-"""Sums of a part whose update has failed; see `Part.sums`."""
+"""What a part without cells, since its update has failed, adds to `Part.sums`. The last number counts such parts."""
 
 
 class Chunks:
-    """Generators that follow one another on a Hilbert curve.
+    """The generators of a part along a Hilbert curve, in chunks of generators near each other.
 
     Parameters
     ----------
@@ -105,16 +107,16 @@ class BallGroups:
     centers : (m, d) float
     radii : (m,) float
     order : (m,) int
-        BallGroups of the groups, one group after the other.
+        Numbers of the balls, group by group.
     firsts : (k,) int
         Where groups begin in `order`.
     own : int
-        Number of groups around generators of the part; the others are around ghosts.
+        Number of groups around generators of the part. They come first; the others are around ghosts.
 
     Attributes
     ----------
     centers, radii : arrays
-        In this order.
+        Those of the balls, group by group.
     boxes : (k, 2 d) float
         Lower and upper corners of boxes around the centers of each group.
     facts : (k, 2 d + 3) float
@@ -132,7 +134,7 @@ class BallGroups:
         self.facts = np.column_stack([self.boxes, self.largest, skins, np.arange(len(firsts)) < own])
 
     def facing(self, facts: np.ndarray) -> Facing:
-        """Return how far these balls are from those of another part, which has sent its `facts` (k, 2 d + 3)."""
+        """Return how far these balls are from the boxes of another part, which has sent its `facts` (k, 2 d + 3)."""
         boxes, largest = facts[:, :-3], facts[:, -3]
         away = gaps(self.boxes, around(boxes))[:, 0]
         reach = np.where(
@@ -165,9 +167,9 @@ class Facing:
     Attributes
     ----------
     facts : (m, 2 d + 3) float
-        Of the boxes of the other part; see `BallGroups`.
+        Facts about the groups of the other part; see `BallGroups`.
     away : (k,) float
-        Distance of each group from all boxes with which it has no pairs, or less.
+        Lower bound of the distance of each group from the boxes with which its balls have no pairs.
     places, others, ways : (p,) int, int, float
         Pairs of a ball and a box, and the distances of its center from this box.
     """
@@ -181,20 +183,21 @@ class Facing:
 
 @dataclass(frozen=True)
 class Answers:
-    """What parts have answered to requests of each other.
+    """The answers of one round of requests, in which each part asks the others for generators.
 
     Attributes
     ----------
     balls : BallGroups
         Those of this part.
     asked : (m,) int
-        Which of them may have unknown generators.
+        Numbers of those that may contain generators that this part does not know.
     facing : dict of Facing
         By the numbers of the other parts.
     given : list of (k,) int32
-        For each part those of the own generators in its balls that it does not know.
+        For each part, the own generators in its balls that it has not known.
     new : list of (k, d + 2) float
-        What each part has given: rows, whether they are needed, and positions.
+        The generators that each part has given: their rows there, whether the cells of this part need them, and their
+        positions.
     """
 
     balls: BallGroups
@@ -209,7 +212,7 @@ class Answers:
         return int(sum(rows[:, 1].sum() for rows in self.new))
 
     def shrink(self) -> None:
-        """Make the balls smaller, so that no new generator is nearer to one of them than a skin."""
+        """Make the balls smaller, until none of the given generators, which do not become ghosts, is within a skin."""
         places, balls = np.concatenate([rows[:, 2:] for rows in self.new]), self.balls
         if len(places) and len(self.asked):
             tree = scipy.spatial.cKDTree(places)
@@ -237,8 +240,8 @@ def around(boxes: np.ndarray) -> np.ndarray:
 def inside(points: np.ndarray, balls: np.ndarray) -> np.ndarray:
     """Return which of `points` (n, d) are in one of the `balls` (m, d + 1), (n,) bool.
 
-    With one more coordinate, sqrt(R^2 - r^2) of a ball with radius r <= R and 0 of a point, they are those that are
-    nearer than R to one of the centers.
+    The center of a ball with radius r gets one more coordinate, sqrt(R^2 - r^2), where R is the largest radius; that of
+    a point is 0. A point is then in the ball if it is nearer than R to the center.
     """
     if not len(points) or not len(balls):
         return np.zeros(len(points), bool)
@@ -327,7 +330,7 @@ class PartSteps(DomainSteps):
         self._limits[n:, 1] = np.inf
 
     def _note(self, points: cla.Array) -> None:
-        """Note the positions, in `points` (count, d), of the last request for ghosts."""
+        """Keep the positions for which the limits hold, `points` (count, d), and upload the limits."""
         engine = self.stages.engine
         self._at = self._room("at", size=points.size).reshape(points.shape)
         cl.enqueue_copy(engine.queue, buffer_of(self._at), buffer_of(points), byte_count=points.nbytes)
@@ -374,7 +377,7 @@ class PartSteps(DomainSteps):
         return self._finished(part, t)
 
     def _finished(self, part: Part, t: Tessellation | None) -> Tessellation | None:
-        """Return the diagram of own cells, if `t` is one in all parts, and no ghosts were missing."""
+        """Return the diagram of own cells; None if ghosts were missing, or if a part has no diagram `t`."""
         engine, n, sums = self.stages.engine, part.n_own, FAILED
         if part.ghosts is None:
             return None if t is None else replace(t, part=part)
@@ -384,9 +387,9 @@ class PartSteps(DomainSteps):
             assert self._at is not None
             if self._reads_rows:
                 part.mark_neighbors(engine, t, marks)
-            ghosts = (marks, part.count) if self._reads_rows else (marks, n)
+            rows = part.count if self._reads_rows else n
             given = t.reach, self._at, self._limits_there, 2 * (1 + NOISE[engine.real.name])
-            sums = np.append(part.sums(engine, t, *ghosts, *given), 0)
+            sums = np.append(part.sums(engine, t, marks, rows, *given), 0)
         sums = self.peers.total(sums)
         if sums[-1] or t is None:
             return None
@@ -398,11 +401,9 @@ class PartSteps(DomainSteps):
         return replace(own, part=part, whole=whole, points=part.points, sites=part.points)
 
     def _check(self, volume: float, gap: float, faces: float) -> None:
-        """Raise if the cells of all parts do not fill the domain, or faces between parts have one side."""
-        real = self.stages.engine.real
-        corners = self.box.device_corners(real)
-        measure = float(np.prod((corners[1] - corners[0])[: self.domain.dim].astype(float)))
-        off = abs(volume / measure - 1)
+        """Raise if the cells of all parts do not fill the domain, or a face between two parts has only one side."""
+        real, (lower, upper) = self.stages.engine.real, self._corners
+        off = abs(volume / float(np.prod(upper - lower)) - 1)
         if off > FILLED[real.name] or abs(gap) > MATCHED[real.name] * faces:
             raise ClvoroError(
                 f"the cells of all ranks differ from the domain by {off:.2g} of its volume, and faces between them by "
@@ -410,7 +411,7 @@ class PartSteps(DomainSteps):
             )
 
     def _ask_again(self, part: Part, t: Tessellation, marks: cla.Array) -> bool:
-        """Ask for ghosts as the cells of `t` need them; return whether there are no new ones."""
+        """Ask for the ghosts that the cells of `t` need. Return False if there are new ones."""
         n, x = part.n_own, part.points.get().astype(float)
         ghosts = np.empty(0, int)
         if self._reads_rows:
@@ -444,9 +445,9 @@ class PartSteps(DomainSteps):
         x : (n or more, d) float
             Positions of the generators, and of ghosts.
         ghosts : (k,) int
-            Rows in `x`.
+            Rows of the ghosts in `x`.
         radii, needed : (n + k,) float
-            Of the balls, and of those that the present cells need.
+            Radii of the balls to ask for, and of the balls that the present cells need.
         """
         self.asked += 1
         own, n = self._chunks, len(self._chunks.order)
@@ -471,14 +472,14 @@ class PartSteps(DomainSteps):
         return Answers(balls, np.unique(np.concatenate(asked)), facing, given, peers.exchange(sent))
 
     def _take(self, answers: Answers) -> None:
-        """Add what parts have given to the lists of ghosts."""
+        """Add the generators that parts have given each other to the lists of ghosts."""
         self._sent = [np.concatenate(pair) for pair in zip(self._sent, answers.given, strict=True)]
         numbers = np.repeat(np.arange(len(answers.new)), [len(rows) for rows in answers.new])
         rows = np.concatenate([rows[:, 0] for rows in answers.new]).astype(np.int32)
         self._parts, self._rows = np.concatenate([self._parts, numbers]), np.concatenate([self._rows, rows])
 
     def _limit(self, answers: Answers, count: int, ghosts: np.ndarray) -> None:
-        """Set the limits of `count` rows, of which `ghosts` are those of ghosts with balls."""
+        """Set the limits of `count` generators and ghosts. Of the ghosts only the rows `ghosts` (k,) have balls."""
         n, order = len(self._chunks.order), self._chunks.order
         self._limits = np.full((count, 2), np.inf)
         self._limits[n:, 0] = 0
@@ -491,7 +492,7 @@ class PartSteps(DomainSteps):
     def _unknown(self, own: BallGroups, balls: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the own generators in `balls` (m, d + 2) that are not among the `known` ones, and their positions.
 
-        Rows of balls end with a radius that does not count, and their own.
+        A row of `balls` is a center and two radii. The first, which the cells of the other part need, does not count.
         """
         chunks, dim = self._chunks, own.centers.shape[1]
         if not len(balls):
@@ -509,8 +510,8 @@ class PartSteps(DomainSteps):
     def _limits_of(self, balls: BallGroups, facing: dict[int, Facing]) -> tuple[np.ndarray, np.ndarray]:
         """Return the limits of own generators along the curve, (n,) each; see `is_within_limits` in part.cl.
 
-        A generator that another part does not know has the distance of a skin from each ball of it at least. The
-        radius of a ball far from all others is a share of their distance.
+        A generator that another part does not know is at least a skin away from each ball of that part. Far from all
+        other parts, the radius of a ball is a share of the distance to them.
         """
         chunks = self._chunks
         n, k = len(chunks.order), len(chunks.firsts)

@@ -126,7 +126,7 @@ class DomainSteps:
         return t
 
     def volumes_of_mesh(self, t: Tessellation, labels: cla.Array) -> np.ndarray | None:
-        """Return the volumes of cells in the mesh by `labels`, (n,), 0 for none; None if they are those of `t`."""
+        """Return the volumes of cells in the final mesh, (n,) by `labels`; None if they are those of `t`."""
 
     def warn_of_leaks(self, t: Tessellation) -> None:
         """Warn of cells of the final diagram `t` that the walls do not bound."""
@@ -168,7 +168,7 @@ class SolidWalls(DomainSteps):
         self.walls.find(part.points)
 
     def volumes_of_mesh(self, t: Tessellation, labels: cla.Array) -> np.ndarray:
-        """Return the volumes of cells in the mesh that ends at the surface."""
+        """Return the volumes of cells in the mesh that ends at the surface, 0 for generators without a cell there."""
         from .readback.solid import mesh_volumes
 
         return mesh_volumes(self.stages.engine.alone(), self.domain, t, labels)

@@ -35,11 +35,11 @@ def read_generators(domain: Domain, t: Tessellation, labels: cla.Array) -> tuple
 
 
 def mesh_volumes(engine: Engine, domain: Domain, t: Tessellation, labels: cla.Array) -> np.ndarray:
-    """Return the volumes of the cells that the mesh of a solid has for the generators of `t`, (n,); 0 for none."""
+    """Return the volumes of cells in the mesh of a solid, (n,) by labels; 0 for generators of `t` without a cell."""
     points, sizes = read_generators(domain, t, labels)
     try:
         mesh = make_mesh(engine, cast("Solid", domain), points, sizes, warns=False)
-    except InputError:  # the end of the run tells
+    except InputError:  # raised at the end of the run, too
         return np.zeros(t.n)
     assert mesh.home is not None
     return np.bincount(np.where(mesh.home < 0, -1 - mesh.home, mesh.home), mesh.volumes, t.n)
@@ -48,8 +48,8 @@ def mesh_volumes(engine: Engine, domain: Domain, t: Tessellation, labels: cla.Ar
 def make_mesh(engine: Engine, domain: Solid, points: np.ndarray, sizes: np.ndarray, warns: bool = True) -> Diagram:
     """Return the mesh of a solid by its generators `points` (n, 3), for cells of the `sizes` (n,).
 
-    Cells of a run are cut by planes of their own, and do not fit together. Those of the mesh are those of the Voronoi
-    diagram of the same generators, and end at the surface. With `warns` it warns of what is wrong.
+    In a run each cell is cut by planes of its own, and cells do not fit together. The mesh has the Voronoi cells of the
+    same generators, cut at the surface. With `warns` the function warns of defects of the mesh.
 
     Raises
     ------
