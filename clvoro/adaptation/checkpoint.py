@@ -311,7 +311,7 @@ class Saved:
         return MeshState(setup, self.size_factor, arrays, next_label=self.state["next_label"], taken=a["taken"])
 
     def _compare(self, setup: Setup, schedule: list[Action]) -> None:
-        """Raise if the points are not in the domain, or schedule or size field differ from those of the saved run."""
+        """Raise an error if points lie outside the domain, or if schedule or size field differ from the saved run."""
         engine, a = setup.stages.engine, self.arrays
         if len(a["mesh.h"]):
             self._check_points(setup.domain)

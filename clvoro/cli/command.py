@@ -393,23 +393,20 @@ def _silence() -> Iterator[None]:
 
 def _explain(error: BaseException) -> tuple[object, int]:
     """Return the message for `error` and the exit code. Raise an error again that shows a fault of clvoro."""
-    if isinstance(error, KeyboardInterrupt | Aborted):
-        return "interrupted, nothing more has been written", INTERRUPTED
-    if isinstance(error, MemoryError) and not isinstance(error, ClvoroError):
+    try:
+        raise error
+    except (OutputError, BuildError):
+        return error, FAILED
+    except (InputError, InputTypeError):
+        return error, BAD_INPUT
+    except DeviceError:
+        return error, NO_DEVICE
+    except (ClvoroError, OSError):
+        return error, FAILED
+    except MemoryError:
         return f"the host is out of memory ({error}); give the process more, or ask for fewer cells", FAILED
-    for kinds, code in _CODES:
-        if isinstance(error, kinds):
-            return error, code
-    raise error
-
-
-_CODES: tuple[tuple[tuple[type[BaseException], ...], int], ...] = (
-    ((OutputError, BuildError), FAILED),
-    ((InputError, InputTypeError), BAD_INPUT),
-    ((DeviceError,), NO_DEVICE),
-    ((ClvoroError, OSError), FAILED),
-)
-"""Classes of errors and their exit code; the first row that has the class of an error counts."""
+    except (KeyboardInterrupt, Aborted):
+        return "interrupted, nothing more has been written", INTERRUPTED
 
 
 def _warning_printer() -> Callable[..., None]:

@@ -362,7 +362,7 @@ class Job:
         return ("mesh.pvtu",) if self.pieces else ("mesh.vtu", "mesh.npz")
 
     def _mesh_file_of(self, other: str) -> str:
-        """Return the name of the mesh of another method than the last."""
+        """Return the file name of the mesh of the method `other`, one before the last."""
         return f"mesh-{other}{Path(self._mesh_files[-1]).suffix}"
 
     def _write(self, adapter: Any, size: Any, results: dict[str, Result], where: str) -> None:
