@@ -3,14 +3,16 @@
 Nodes divide a chain of creases into chords, equidistributed by 1 / h; a chain shorter than h is one chord. Around each
 node is a ball without other generators. Beside a chord k generators stand where the spheres around its two ends
 intersect, in the middle of k equal sectors. With the mean interior angle alpha of the chain, k = round(alpha / 90
-degrees), as far as sectors are 60 to 120 degrees wide then. So all their bisectors contain the chord, and each of the
-outermost two is nearest to one wall only. Where chains meet, the node in the corner is one of all of them. Generators
-of two chains that are near each other become one, on the spheres of both. Mirror images of the generators in the walls
+degrees); a chord where sectors would be wider than 120 degrees has more. So all their bisectors contain the chord, and
+each of the outermost two is nearest to one wall only. Chains that meet in a corner share the node there. Generators of
+two chains that are near each other become one, on the spheres of both. Mirror images of the generators in the walls
 there complete the corner.
 
-Generators have no room if a wall or others are near, or if others are in a ball. They come nearer to their crease then,
-step by step; in the end those of the shortest chains are left out. The cells of those that are nearer are smaller than
-others, and their target size is the size that they have. So it is around creases with a radius of about two cells.
+A generator has no room if a wall or another generator is near, or if a ball around its crease holds a generator of
+another one. Then the generators around that chord come nearer to it, step by step. If the least distance does not
+suffice, those of the shortest chain are left out. Generators that are nearer have smaller cells than the size field
+asks for. Errors of sizes do not count there: the target size of such a cell is the size that it has. The same holds
+around creases that are curved as narrowly as a circle with a radius of two cells.
 """
 
 from __future__ import annotations
@@ -19,7 +21,6 @@ import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -32,15 +33,14 @@ if TYPE_CHECKING:
     from .solid import Solid
 
 _CLEAR = 1.06  # radius in which no other generators are, over that of the sphere
-_OTHERS = 0.97  # of a radius: generators that are this near to a node and not around it are in its ball
+_OTHERS = 0.97  # of a radius: a ball is taken if a generator that is not on it is nearer to its center
 _ROOM = 0.5  # of h: least distance of generators that are not the same
 _WALL = 0.3  # of h: least distance of generators from walls
 _SHORTEST = 0.3  # over h: shorter creases have no generators of their own
-_SHRINKAGE, _LEAST = 0.8, 0.2  # steps in which generators without room come nearer to a crease, and how near
-_SECTORS = math.radians(120), math.radians(60)  # widest and narrowest sectors of generators
-_WIDEST = math.radians(150)  # sectors where there is no room for more generators
-_SHORT = 0.8  # over the radii at its ends: the radii are the same at both ends of shorter chords
-_CURVED = math.radians(25)  # mean angle between the chords of a narrow curve
+_SHRINKAGE, _LEAST = 0.8, 0.2  # of the scale of chords whose generators have no room: factor of a step, and end
+_WIDEST, _WIDEST_CROWDED = math.radians(120), math.radians(150)  # sectors, and those where there is little room
+_SHORT = 0.8  # over the radius at its first end: a shorter chord has the same radius at both ends
+_CURVED = math.radians(25)  # mean angle between neighboring chords above which a crease is a narrow curve
 _SAMPLES = 8  # of 1 / h per step, at least
 _FEWEST = 64  # samples per chain, at least
 _MOST = 1 << 16
@@ -124,7 +124,7 @@ def place_stations(solid: Solid, size: Callable[[np.ndarray], np.ndarray]) -> St
     chains = [chain for chain in chains if len(chain.h)]
     while True:
         placing = _placed(solid, chains)
-        crowded = [placing.crowded(chain) for chain in chains]
+        crowded = np.split(placing.without_room(), np.cumsum([len(chain.h) for chain in chains]))[:-1]
         if any([chain.shrink(where) for chain, where in zip(chains, crowded, strict=True)]):
             continue
         left = [k for k, where in enumerate(crowded) if where.any()]
@@ -132,7 +132,6 @@ def place_stations(solid: Solid, size: Callable[[np.ndarray], np.ndarray]) -> St
             break
         shortest = min(left, key=lambda k: len(chains[k].h))
         chains[shortest].leave_out(crowded[shortest])
-    placing.leave_out()
     placing.complete(solid)
     return placing.stations()
 
@@ -155,8 +154,8 @@ class ChainOfChords:
     number : int
     vertices : (2,) int
         Those at its ends.
-    h, full, middle : (n,) float
-        Of each chord: size of the cells, their size where there is room, and length along the chain.
+    h, middle : (n,) float
+        Of each chord: size of the cells, and length along the chain up to its middle.
     lengths, ways : (n,) and (n, 3) float
         Of each chord: length, and unit vector.
     nodes, radii : (n + 1, 3) and (n + 1,) float
@@ -181,7 +180,6 @@ class ChainOfChords:
     ) -> None:
         self.number, self.line, self.vertices = number, line, vertices
         at, self.middle, self.h = _divide(self.line, size, ends, shortest)
-        self.full = self.h
         self.nodes = self.line.along(self.line.points, at)
         chords = np.diff(self.nodes, axis=0)
         self.lengths = np.linalg.norm(chords, axis=1)
@@ -195,8 +193,8 @@ class ChainOfChords:
 
     @property
     def sized(self) -> np.ndarray:
-        """Whether the target size of the cells around each chord is the size that they have, (n,) bool."""
-        return self.h < self.full
+        """Whether the cells around each chord have the size that they have as target size, (n,) bool."""
+        return np.zeros(len(self.h), bool)
 
     @property
     def count(self) -> np.ndarray:
@@ -219,30 +217,32 @@ class _Crease(ChainOfChords):
     ----------
     angle : (n,) float
         The interior angle at each chord, in radians.
+    full : (n,) float
+        The size of the cells around each chord where there is room.
     scale : (n,) float
-        The size of the cells around each chord, over the full one.
-    spent : (n,) bool
-        Whether they are as small as may be.
+        Their size over the full one. Below `_LEAST` it stays.
+    sectors : (n,) int
+        The number of generators around each chord.
     """
 
     def __init__(self, solid: Solid, number: int, size: Callable[[np.ndarray], np.ndarray]) -> None:
         ends = solid.creases.vertices(number)[[0, -1]]
         super().__init__(number, chain_line(solid, number), ends, size, shortest=_SHORTEST)
+        self.full, self.scale = self.h, np.ones(len(self.h))
         if len(self.h) == 1:  # cells go on beyond the ends of a crease shorter than h
             self.full = np.maximum(self.h, size(self.line.along(self.line.points, self.middle)))
         left, right = (self.line.along(n, self.middle) for n in (self.line.left, self.line.right))
         left, right = (_unit(n - (n * self.ways).sum(axis=1)[:, None] * self.ways) for n in (left, right))
         sine, cosine = (np.cross(left, right) * self.ways).sum(axis=1), (left * right).sum(axis=1)
         self.angle = math.pi - np.arctan2(sine, cosine)
-        # One number along the chain, as far as its sectors allow that, since faces between two numbers are oblique.
+        # Where the number changes along the chain, faces between cells are oblique.
         usual = np.rint(self.angle.mean() / (math.pi / 2)) if len(self.angle) else 2
-        self.sectors = np.clip(usual, *(np.ceil(self.angle / most) for most in _SECTORS)).astype(int)
+        self.sectors = np.maximum(usual, np.ceil(self.angle / _WIDEST)).astype(int)
         self.axes = np.stack([np.cross(left, self.ways), -left], axis=1)
-        self.scale, self.spent = np.ones(len(self.h)), np.zeros(len(self.h), bool)
         self._arrange()
 
     def _arrange(self) -> None:
-        """Place the generators."""
+        """Set the sizes, angles and radii that follow from scale and sectors."""
         self.h = self.full * self.scale
         self.turns = [
             (np.arange(n) + 0.5) * (a / max(n, 1)) for n, a in zip(self.sectors.tolist(), self.angle, strict=True)
@@ -255,20 +255,18 @@ class _Crease(ChainOfChords):
     def sized(self) -> np.ndarray:
         """See `ChainOfChords`. On the inner side of a narrow curve there is less room along the crease than outside."""
         turn = np.einsum("ij,ij->i", self.ways[1:], self.ways[:-1])
-        return super().sized | bool(len(turn) and np.arccos(np.clip(turn, -1, 1)).mean() > _CURVED)
+        return (self.scale < 1) | bool(len(turn) and np.arccos(np.clip(turn, -1, 1)).mean() > _CURVED)
 
     def shrink(self, crowded: np.ndarray) -> bool:
         """Move the generators at `crowded` chords (n,) bool nearer to these; return whether that has been possible.
 
-        Where they are very near already, there are as few as may be from then on, again at the full distance.
+        Where they are very near already, their number is reduced once, and they start again at the full distance.
         """
-        crowded = crowded & ~self.spent
+        crowded = crowded & (self.scale >= _LEAST)
         self.scale[crowded] *= _SHRINKAGE
-        low = crowded & (self.scale < _LEAST)
-        fewest = np.ceil(self.angle / _WIDEST).astype(int)
-        again = low & (fewest < self.sectors)
+        fewest = np.ceil(self.angle / _WIDEST_CROWDED).astype(int)
+        again = crowded & (self.scale < _LEAST) & (fewest < self.sectors)
         self.sectors[again], self.scale[again] = fewest[again], 1
-        self.spent |= low & ~again
         self._arrange()
         return bool(crowded.any())
 
@@ -281,10 +279,21 @@ class _Crease(ChainOfChords):
 def _divide(
     line: Line, size: Callable[[np.ndarray], np.ndarray], ends: tuple[float, float], shortest: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the lengths along a line at the ends of chords, (n + 1,), in their middle, and the sizes there, (n,).
+    """Divide a line into chords that are about as long as the size `size` of cells there.
 
-    The first and the last chord are longer than the others by the factors `ends`. A line shorter than `shortest`, over
-    h, has none.
+    Parameters
+    ----------
+    ends : (2,) float
+        Lengths of the first and the last chord, over the size there.
+    shortest : float
+        A line shorter than this, over the size there, has no chords.
+
+    Returns
+    -------
+    ends, middle : (n + 1,) and (n,) float
+        Lengths along the line at the ends of the chords, and in the middle of each.
+    h : (n,) float
+        Sizes of the cells around the chords.
     """
     total = float(line.at[-1])
     n = _FEWEST
@@ -313,7 +322,7 @@ def _divide(
 
 
 def share_corners(chains: Sequence[ChainOfChords]) -> None:
-    """Give the chains that meet in a corner one radius there, and to both ends of a single short chord as well."""
+    """Average the radii of the chains that meet in a corner. A chain of one short chord joins its two corners."""
     if not chains:
         return
     ends, at = np.unique([chain.vertices for chain in chains], return_inverse=True)
@@ -332,14 +341,17 @@ class AroundCreases:
     def __init__(self, depth: Callable[[np.ndarray], np.ndarray]) -> None:
         self.depth = depth
         self.points, self.sizes, self.chains = np.zeros((0, 3)), np.zeros(0), np.zeros(0, np.int64)
-        self.sized = np.zeros(0, bool)  # whether the target size of a cell is the size that it has
+        self.sized = np.zeros(0, bool)  # of each generator: whether the target size of its cell is the size it has
         self.spots = np.zeros((0, 3))  # the middle of each chord
         self.chords: list[list[int]] = []  # of each generator
         self.balls: list[list[int]] = []  # of each generator
         self.centers: list[np.ndarray] = []
         self.radii: list[float] = []
-        self.lost = np.zeros((0, 3))
-        self.first_chord: dict[int, int] = {}
+
+    @property
+    def lost(self) -> np.ndarray:
+        """The middle of each chord without generators, (k, 3)."""
+        return self.spots[~self._chords_of(np.ones(len(self.points), bool))]
 
     def add(self, chain: ChainOfChords) -> None:
         """Add the generators and balls of a chain."""
@@ -351,12 +363,11 @@ class AroundCreases:
         self.sized = np.append(self.sized, chain.sized[chord])
         self.chains = np.append(self.chains, np.full(len(chord), chain.number))
         self.chords += [[len(self.spots) + i] for i in chord.tolist()]
-        self.first_chord[chain.number] = len(self.spots)
         self.spots = np.vstack([self.spots, chain.line.along(chain.line.points, chain.middle)])
         self.balls += [[first + i, first + i + 1] for i in chord.tolist()]
 
     def keep(self, kept: np.ndarray) -> None:
-        """Keep some of the generators: those of these rows, or where (n,) bool is true."""
+        """Keep the generators `kept`, (k,) int or (n,) bool."""
         rows = np.arange(len(self.points))[kept].tolist()
         self.points, self.sizes, self.chains = self.points[kept], self.sizes[kept], self.chains[kept]
         self.sized = self.sized[kept]
@@ -422,20 +433,17 @@ class AroundCreases:
             radii = np.sqrt(np.maximum(radii**2 + step[3 * n :] * start, 0.25 * start**2))
         self.radii = radii.tolist()
 
-    def crowded(self, chain: ChainOfChords) -> np.ndarray:
-        """Return at which chords of a chain generators are near others, near walls, or outside; (m,) bool."""
-        first = self.first_chord[chain.number]
-        return self._without_room[first : first + len(chain.h)]
+    def without_room(self) -> np.ndarray:
+        """Return which chords have a generator without room, (c,) bool.
 
-    @cached_property
-    def _without_room(self) -> np.ndarray:
-        """Whether each chord has no room, (c,) bool."""
-        crowded = ~self._deep()
+        Another generator or a wall is near it, it is outside, or it is on a ball that is taken.
+        """
+        crowded = ~self._deep() | self._around_taken_balls()
         crowded[np.array(self.near_pairs(), int).ravel()] = True
-        return self._chords_of(crowded | self._around_taken_balls())
+        return self._chords_of(crowded)
 
     def _around_taken_balls(self) -> np.ndarray:
-        """Return which generators are around balls in which there are others, (n,) bool."""
+        """Return which generators are on a ball that is taken: it has one inside that is not on it, (n,) bool."""
         if not len(self.points):
             return np.zeros(0, bool)
         inside = scipy.spatial.KDTree(self.points).query_ball_point(self.centers, _OTHERS * np.array(self.radii))
@@ -460,15 +468,14 @@ class AroundCreases:
         return found
 
     def leave_out(self) -> None:
-        """Leave out generators near others, near walls, or outside; note the chords without any."""
+        """Leave out generators near others, near walls, or outside, with all others around the same chord."""
         keep = self._deep()
         for i, j in self.near_pairs():
             if keep[i] and keep[j]:
                 keep[j] = False
-        # Without one of them, faces between the others may lie in a wall beyond the crease: all leave together.
+        # Without one of them, faces between the others may lie in a wall beyond the crease.
         lost = self._chords_of(~keep)
         self.keep(np.array([not lost[chords].any() for chords in self.chords], bool))
-        self.lost = self.spots[~self._chords_of(np.ones(len(self.points), bool))]
 
     def complete(self, solid: Solid) -> None:
         """Add the mirror images of generators at corners in the walls of `solid` there."""
@@ -511,7 +518,7 @@ class AroundCreases:
         return (away < _OTHERS * np.array(self.radii)).any(axis=1)
 
     def stations(self) -> Stations:
-        """Return what has been placed."""
+        """Return what has been placed; generators with sizes of their own come last."""
         self.keep(np.argsort(self.sized, kind="stable"))
         used, balls = np.unique([ball for balls in self.balls for ball in balls], return_inverse=True)
         return Stations(
