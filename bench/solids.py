@@ -24,8 +24,8 @@ With `--layers` all patches of the solids have layers of prisms, such as `0.5:5:
 1.3. A row has the inner cells and the prisms, the mean thickness over the one given at the vertices of walls, the
 share of these with at least 0.9 of it, the mean first height where it is at least 0.9 of the one given, and the
 verdicts of `checkMesh` without and with its options.
-With `--surfaces` the domains are those of `bench/_surface_scenes.py`, with surfaces inside. A row has the largest error
-of the volumes of regions that are known, over them, and the number of regions.
+With `--surfaces` the domains are those of `bench/_surface_scenes.py`, with surfaces inside. A row has the number of
+regions, and the largest relative error of a volume of those whose volume is known.
 Pictures show each mesh cut open, with the patches or the regions in colors.
 """
 

@@ -59,7 +59,7 @@ def collapse_short(
     chosen : (f,) bool, optional
         Faces whose corners may move; all by default.
     suspects : (f,) bool, optional
-        `find_suspects(mesh, diagram)`, if they are known.
+        What `find_suspects` returns; by default it is called.
     """
     suspects = find_suspects(mesh, diagram) if suspects is None else suspects
     if chosen is not None:
@@ -94,7 +94,7 @@ def collapse_short(
 
 
 def find_suspects(mesh: Faces, diagram: Diagram) -> np.ndarray:
-    """Return a mask (f,) of the faces that may be small or skew, or have a short side: all of them, and a few others.
+    """Return which faces may be small or skew, or have a short side, (f,) bool. A few may have none of these.
 
     All faces are read here, and never again. Their areas are those of the diagram.
     """

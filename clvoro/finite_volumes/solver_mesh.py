@@ -115,8 +115,9 @@ def _collapsed_polyhedra(mesh: Faces, diagram: Diagram, parts: np.ndarray, colla
         return mesh.compact()
     suspects = find_suspects(mesh, diagram)
     made = collapse_short(mesh, diagram, suspects=suspects)
-    if diagram.faces.diagram is not None:  # its cells are convex
+    if diagram.faces.diagram is not None:  # Voronoi cells are convex
         return made
+    # Where OpenFOAM would reject collapsed cells at a surface, these and their neighbors stay as they are.
     held = np.zeros(mesh.n_cells, bool)
     for _ in range(_ROUNDS):
         rejected = spoiled_near_walls(mesh, made) & ~held

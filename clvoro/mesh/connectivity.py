@@ -24,7 +24,7 @@ def distinct(values: np.ndarray) -> np.ndarray:
 
 
 def used_indices(indices: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the numbers below `count` that occur among `indices`, sorted, and the place of each index among them."""
+    """Return the numbers below `count` that occur in `indices`, ascending, and the row of each index among these."""
     used = np.zeros(count, bool)
     used[indices] = True
     return np.flatnonzero(used), np.take(np.cumsum(used, dtype=np.int32) - 1, indices)
@@ -69,7 +69,7 @@ def take_ranges(
 
 
 def rows_with(starts: np.ndarray, chosen: np.ndarray) -> np.ndarray:
-    """Return which rows of ragged items have one that is `chosen` (k,) bool: `reduceat` in a fraction of its time."""
+    """Return which rows of a ragged array of k items have one that is `chosen` (k,) bool; an empty row has none."""
     found = np.empty(len(starts) - 1, bool)
     for part in slices(len(found)):
         here = starts[part.start : part.stop + 1]

@@ -58,13 +58,14 @@ class Step:
 
 @dataclass(frozen=True)
 class StepOfMesh(Step):
-    """A step after which the cells of the mesh have their sizes where walls are curved, not those of the device.
+    """A step that gives the cells of the resulting mesh their sizes, also at curved walls.
 
-    A mesh is made before the step, and tells by how much the cells of both differ.
+    There the cells on the device are cut by planes, while those of the mesh end at the surface. A mesh is made before
+    the step, and the step makes up for the difference.
     """
 
     def apply(self, run: Run) -> None:
-        """Take the step towards sizes that make up for the difference, and record it."""
+        """Make a mesh, take the step, and record it."""
         factors = run.state.sizes_over_mesh()
         if factors is not None:
             run.state.h.set(run.state.h.get() * factors)
@@ -75,13 +76,13 @@ class StepOfMesh(Step):
 
 @dataclass(frozen=True)
 class CountOfMesh:
-    """Insert and delete generators for the volume of the mesh where walls are curved, not that of the device's cells.
+    """Insert and delete generators, so that their number is that for the cells of the resulting mesh; see `StepOfMesh`.
 
-    A mesh is made before.
+    With a fixed number of cells nothing is done.
     """
 
     def apply(self, run: Run) -> None:
-        """Insert and delete."""
+        """Make a mesh, and insert and delete."""
         mesh = run.state
         factors = mesh.sizes_over_mesh() if run.fixed_count is None else None
         if factors is None:

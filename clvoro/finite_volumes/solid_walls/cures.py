@@ -62,11 +62,11 @@ class Cures:
     surface : WallSurface
     faces : Faces
     names : (n,) int
-        Generators of the cells: cells of two meshes may be the same if their names are.
+        The generator of each cell. Two meshes share a cell only if its name is the same in both.
     sizes : (n,) float
         h of the cells.
     earlier : Cures, optional
-        Those of an earlier mesh. In cells that both meshes share they are repeated.
+        Those of an earlier mesh. They are repeated in cells that both meshes share.
 
     Attributes
     ----------
@@ -87,7 +87,7 @@ class Cures:
             self._take_over(earlier)
 
     def _take_over(self, earlier: Cures) -> None:
-        """Repeat earlier cures in cells that both meshes share, and note in which of these no cure helped."""
+        """Repeat earlier cures in the cells that both meshes share; note those of these cells that no cure helped."""
         old = earlier.edits
         matches = Matches(old, earlier.names, self.edits, self.names)
         cells = self.edits.repeat(old, matches)
@@ -453,10 +453,11 @@ def cured(
     rejected: np.ndarray,
     earlier: Cures | None,
 ) -> tuple[Faces, np.ndarray, np.ndarray, np.ndarray, Cures | None]:
-    """Return the mesh with its `rejected` cells (k,) cured where that works, and the cell that each was.
+    """Cure the `rejected` cells (k,) of a mesh where that works.
 
-    Then follow `own` and rejected cells, as in `_Made`, and the cures. The mesh stays as it is if cures would leave
-    more cells rejected. `earlier` cures are those of an earlier mesh of the solid; see `Cures`.
+    The mesh stays as it is if cures would leave more cells rejected. `earlier` cures are those of an earlier mesh of
+    the solid; see `Cures`. Return the mesh; which of the given cells each of its cells was; `own` and the cells that
+    are still rejected, as in `_Made`; and the cures.
     """
     if len(rejected) > _TOO_MANY * faces.n_cells:
         return faces, np.arange(faces.n_cells), own, rejected, None

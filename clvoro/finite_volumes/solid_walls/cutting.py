@@ -152,9 +152,10 @@ class CellCut:
         return found
 
     def _divide(self, k: int, i: int, j: int) -> list[int] | None:
-        """Divide a face along the section, from its vertex i to j; return the vertices of the section between these.
+        """Divide face k along the section, from its vertex i to its vertex j.
 
-        A face whose upper part is in the plane stays whole: the section follows its sides. None: the cut fails.
+        A face whose upper part is in the plane stays whole: the section follows its sides. Return the vertices of the
+        section between i and j, or None if the cell cannot be cut like this.
         """
         edits, loop, after = self.edits, self.edits.seen(k, self.cell), list[int]()
         if k in self.parts or i not in loop or j not in loop:

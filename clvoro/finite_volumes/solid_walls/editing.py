@@ -16,7 +16,7 @@ from ...mesh.faces import Faces
 from ..gate import LEAST_DETERMINANT, LEAST_MEASURE
 
 _MOST_FACES = 200
-"""A cell with more faces than this is no real one. It stands for all cells far from walls; see `NearWalls`."""
+"""A cell with more faces than this is no cell of the mesh. It stands for all cells far from walls; see `NearWalls`."""
 _ROUNDING = 1e-9
 """Vertices of two meshes at the same place differ by at most this share of the extent of the mesh."""
 Face = tuple[int, int, tuple[int, ...]]
@@ -258,14 +258,14 @@ class Edits:
         Parameters
         ----------
         other : Edits
-            Of another mesh.
+            Those of another mesh of the same solid.
         matches : Matches
-            Between that mesh and this one. New faces and vertices are added to it.
+            Between that mesh and this one. It gets the new faces and vertices as well.
 
         Returns
         -------
         dict of int
-            The number here of each cell that has changed in all trials of which it was a part.
+            Of each cell of the other mesh whose changes have all been repeated: its number in this mesh.
         """
         cells, faces, points = dict[int, int](), matches.faces, matches.points
         different = set[int]()

@@ -14,7 +14,7 @@ NARROW = 0.08
 
 
 def narrow_faces(faces: Faces, sizes: np.ndarray, among: np.ndarray) -> np.ndarray:
-    """Return the small faces between two cells with which one of the cells `among` (n,) bool is concave, (f,) bool.
+    """Return the small faces between two cells that make one of them concave, (f,) bool.
 
     Where a wall is curved, the common edge of two wall polygons may bulge out of the planes of both. So does the center
     of the face between their cells if that is small.
@@ -25,6 +25,7 @@ def narrow_faces(faces: Faces, sizes: np.ndarray, among: np.ndarray) -> np.ndarr
     sizes : (n,) float
         h of the cells.
     among : (n,) bool
+        The cells that are examined.
     """
     chosen = np.zeros(len(faces), bool)
     chosen[faces.measures.concave_pairs(DefectLimits().concavity, among)[0]] = True
@@ -35,36 +36,41 @@ def narrow_faces(faces: Faces, sizes: np.ndarray, among: np.ndarray) -> np.ndarr
 
 def rejected_at_walls(faces: Faces, judged: np.ndarray) -> np.ndarray:
     """Return which of the cells `judged` (n,) bool at walls, or beside these, OpenFOAM rejects, (k,) int."""
-    at_wall = _at_wall(faces)
-    judged = judged & with_neighbors(faces, at_wall)
+    walls = at_wall(faces)
+    # Other faces are those of the diagram, whose tetrahedra are right.
+    return _rejected(faces, judged & with_neighbors(faces, walls), walls)
+
+
+def _rejected(faces: Faces, judged: np.ndarray, doubtful: np.ndarray) -> np.ndarray:
+    """Return which of the cells `judged` (n,) bool OpenFOAM rejects, (k,) int; it tests faces of `doubtful` cells."""
     kept = with_neighbors(faces, judged)
     cells, part = np.flatnonzero(kept), faces.part(kept)[0]
-    # Other faces are those of the diagram, whose tetrahedra are right.
-    doubtful = at_wall[cells]
+    doubtful = doubtful[cells]
     tested = np.flatnonzero(doubtful[part.owner] | (doubtful[np.maximum(part.neighbor, 0)] & (part.neighbor >= 0)))
     return cells[rejected_cells(part, tested, judged[cells])]
 
 
 def spoiled_near_walls(before: Faces, made: Faces) -> np.ndarray:
-    """Return which cells near walls OpenFOAM rejects after a collapse that has changed them, (n,) bool.
+    """Return which cells near walls `collapse_short` has changed so that OpenFOAM rejects them, (n,) bool.
 
-    Such cells may have small defects before. A collapse may exchange these for others.
+    Cells there may have small defects before. A collapse may exchange these for others.
     """
     near = with_neighbors(before, touching_walls(before))
     judged = changed_cells(before, made, near) & near
-    kept = with_neighbors(made, judged)
-    cells, part = np.flatnonzero(kept), made.part(kept)[0]
-    mine = judged[cells]
-    tested = np.flatnonzero(mine[part.owner] | (mine[np.maximum(part.neighbor, 0)] & (part.neighbor >= 0)))
-    found = np.zeros(len(kept), bool)
-    found[cells] = rejected_cells(part, tested, mine)
+    found = np.zeros(len(judged), bool)
+    found[_rejected(made, judged, judged)] = True
     return found
 
 
 def changed_cells(before: Faces, made: Faces, among: np.ndarray | None = None) -> np.ndarray:
-    """Return which cells of a mesh have been changed by `collapse_short`, (n,) bool.
+    """Return which cells `collapse_short` has changed, (n,) bool.
 
-    Faces without a cell `among` (n,) bool are not examined.
+    Parameters
+    ----------
+    before, made : Faces
+        The mesh before and after it.
+    among : (n,) bool, optional
+        Only faces of these cells are compared; all by default.
     """
     row = np.full(before.half_face.max() + 1, -1)
     row[before.half_face] = np.arange(len(before))
@@ -106,7 +112,7 @@ def with_neighbors(faces: Faces, cells: np.ndarray, rings: int = 1) -> np.ndarra
     return cells
 
 
-def _at_wall(faces: Faces) -> np.ndarray:
+def at_wall(faces: Faces) -> np.ndarray:
     """Return which cells have a wall, (n,) bool."""
     found = np.zeros(faces.n_cells, bool)
     found[faces.owner[faces.n_inner :]] = True

@@ -17,7 +17,7 @@ from ...mesh.faces import Faces
 from ..collapse import collapse_short
 from .chains import Crossings, cross_cells
 from .cures import Cures, cured
-from .mend import changed_cells, narrow_faces, rejected_at_walls, touching_walls, with_neighbors
+from .mend import at_wall, changed_cells, narrow_faces, rejected_at_walls, touching_walls, with_neighbors
 from .near_walls import NearWalls
 from .pierce import IN, WALL, pierce_edges, sides, simplified
 from .polygons import Divider, chain_loops, open_sides
@@ -31,7 +31,7 @@ _CERTAIN = 0.3
 _CLEAR = 1.4
 """Least distance of outer generators from the whole surface, over h: no cell is that wide at a wall."""
 _SAME = 1e-3
-"""Outer generators are the same if they are nearer to each other than this share of the least h."""
+"""Two outer generators are at the same place if they are nearer to each other than this share of the least h."""
 EXACT, FILLED, ROUNDED = range(3)
 """How the walls of a cell are made: with all creases; without concave creases; without creases.
 
@@ -40,14 +40,16 @@ _THIN, _ACROSS = 0.7, 0.35
 """A part of a solid is thin if both walls are nearer to a generator than this share of h; how far generators are spread
 across it, over h."""
 _AROUND = 0.85
-"""Distance over h from a concave crease within which they stay, as their faces meet there."""
+"""Generators nearer to a concave crease than this share of h stay: the faces between their cells meet in it."""
 _GOLDEN = (5**0.5 - 1) / 2
 _FEW = 0.03
 """Largest share of generators without a cell; a solid with more of them is refused."""
 _PATIENCE, _ATTEMPTS = 3, 8
 """How often a mesh is made again without fewer rejected cells than before, and at all."""
-_MOVES, _MOVE, _BESIDE = 4, 0.15, 1.3
-"""How often generators of rejected cells are moved, how far, and how far from them those are that move, too, over h."""
+_MOVES = 4
+"""How often generators of rejected cells are moved, at most."""
+_MOVE, _BESIDE = 0.15, 1.3
+"""How far they are moved, over h. Generators nearer to them than the second number, over h, are moved as well."""
 _DEEP = 0.1
 """Least depth of moved generators in the solid, over h."""
 _MISSED = 0.1
@@ -102,7 +104,7 @@ def outer_generators(surface: WallSurface, points: np.ndarray, sizes: np.ndarray
     placed, h = placed[clear], h[clear]
     if not len(placed):
         return placed
-    # Generators of a lattice behind each other have the same point.
+    # Generators of a lattice in one line upright on a wall have the same outer one.
     twice = scipy.spatial.KDTree(placed).query_pairs(_SAME * float(h.min()), output_type="ndarray")
     return np.delete(placed, twice[:, 1], axis=0)
 
@@ -153,8 +155,8 @@ def solid_diagram(
 ) -> Diagram:
     """Return the mesh of a solid as a diagram, without short edges at walls.
 
-    Where cells are still rejected in the end, generators of them and beside them are moved a little, and the mesh is
-    made again.
+    Where OpenFOAM would reject cells, their generators and those beside them are moved a little, and the mesh is made
+    again.
 
     Parameters
     ----------
@@ -169,6 +171,7 @@ def solid_diagram(
     tell : callable
         Called with the name of each part of the work.
     warns : bool
+        Whether it warns of what is wrong with the mesh.
 
     Raises
     ------
@@ -178,8 +181,8 @@ def solid_diagram(
     Warns
     -----
     MismatchWarning
-        With `warns`, if generators have no cell, cells are cut, leave out creases, or are concave: how many, and the
-        first place.
+        With `warns`, if generators have no cell, cells are cut, leave out creases, or are concave. It says how many,
+        and the first place.
     """
     near = NearWalls.of(surface, points, sizes, whole(points))
     best = made = _Attempts(surface, near, np.full(len(near.sizes), EXACT, np.int8), None, tell)
@@ -221,7 +224,10 @@ def solid_diagram(
 
 
 def _moved(surface: WallSurface, points: np.ndarray, sizes: np.ndarray, rows: np.ndarray, move: int) -> np.ndarray:
-    """Return generators, those of `rows` and beside them moved, each time in other directions; they stay inside."""
+    """Return all generators. Those of `rows` (k,) int and near these are moved, but stay in the solid.
+
+    The number `move` of the attempt gives the directions.
+    """
     beside = scipy.spatial.KDTree(points).query_ball_point(points[rows], _BESIDE * sizes[rows])
     rows, points = np.unique(np.concatenate(beside).astype(np.int64)), points.copy()
     away = np.random.default_rng(move).normal(size=(len(rows), 3))
@@ -315,7 +321,7 @@ def _finished(
 ) -> _Made:
     """Return `raw` cells near the surface without short edges and slivers, cured where OpenFOAM rejects them.
 
-    `earlier` cures are taken over where the cells are the same.
+    `earlier` cures are repeated in cells that both meshes share.
     """
     home, own, cures = raw.home, raw.own, None
     tell("short edges at walls")
@@ -345,12 +351,11 @@ def _collapsed(faces: Faces, sizes: np.ndarray, among: np.ndarray | None = None)
     also which cells have changed, (n,) bool.
     """
     diagram = diagram_of(faces)
-    at_wall = np.zeros(faces.n_cells, bool)
-    at_wall[faces.owner[faces.n_inner :]] = True
+    examined = at_wall(faces)
     if among is not None:
-        at_wall &= among
-    chosen = at_wall[faces.owner] | at_wall[np.maximum(faces.neighbor, 0)]
-    made = collapse_short(diagram.faces, diagram, narrow_faces(diagram.faces, sizes, at_wall), chosen)
+        examined &= among
+    chosen = examined[faces.owner] | examined[np.maximum(faces.neighbor, 0)]
+    made = collapse_short(diagram.faces, diagram, narrow_faces(diagram.faces, sizes, examined), chosen)
     row = np.full(len(diagram.neighbors), -1)
     row[diagram.faces.half_face] = np.arange(len(faces))
     changed = changed_cells(diagram.faces, made)
