@@ -67,19 +67,13 @@ class Ghosts:
     counts: np.ndarray | tuple[int, ...] = ()
 
     @classmethod
-    def of_peers(cls, engine: Engine, peers: Peers, parts: np.ndarray, rows: np.ndarray) -> Ghosts:
-        """Return ghosts whose owners are the `rows` (g,) of `parts` (g,), in ascending order of these.
-
-        The parts tell each other what they need.
-        """
-        wanted = [np.ascontiguousarray(rows[parts == part], np.int32) for part in range(peers.count)]
-        return cls.of_lists(engine, peers, parts, rows, peers.exchange(wanted))
-
-    @classmethod
     def of_lists(
         cls, engine: Engine, peers: Peers, parts: np.ndarray, rows: np.ndarray, sent: Sequence[np.ndarray]
     ) -> Ghosts:
-        """Return the same ghosts. This part knows already which of its rows each part needs: `sent`."""
+        """Return ghosts whose owners are the `rows` (g,) of `parts` (g,), in ascending order of parts.
+
+        Of the rows of this part, each part needs those in its item of `sent`.
+        """
         sizes, counts = np.array([len(needed) for needed in sent]), np.bincount(parts, minlength=peers.count)
         needed = engine.upload(np.concatenate(sent), np.int32)
         return cls(engine.upload(rows, np.int32), None, None, peers, parts, needed, sizes, counts)

@@ -57,7 +57,8 @@ class Halves:
         ghosts = None
         if peers is not None:
             owners = rows[n_own:] - self.bounds[1 - peers.number]
-            ghosts = Ghosts.of_peers(engine, peers, np.full(len(owners), 1 - peers.number), owners)
+            sent = peers.exchange([owners if part != peers.number else owners[:0] for part in range(2)])
+            ghosts = Ghosts.of_lists(engine, peers, np.full(len(owners), 1 - peers.number), owners, sent)
         labels = engine.upload(self.labels[rows], np.int32)
         return Part(n_own, len(rows), engine.upload(self.places[rows]), self.box, ghosts, labels=labels)
 
