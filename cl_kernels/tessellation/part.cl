@@ -84,8 +84,8 @@ kernel void forward_values(const int size, const int n, global const int *rows, 
         values[words * (n + g) + w] = values[words * i + w];
 }
 
-/* Columns `first` to `first` + `words` of packed[p], which has `row` columns, = values[items[p]]: rows of 32-bit words
-   of any type. One work-item per item. */
+/* Copy row items[p] of `values` to row p of `packed`, from column `first` on. Columns are 32-bit words of any type;
+   there are `words` in a row of `values`, and `row` in one of `packed`. One work-item per item. */
 kernel void pack_rows(const int size, global const int *items, global const uint *values, const int words,
                       const int row, const int first, global uint *packed)
 {
@@ -94,7 +94,7 @@ kernel void pack_rows(const int size, global const int *items, global const uint
         packed[row * p + first + w] = values[words * items[p] + w];
 }
 
-/* values[n + p] = those columns of packed[p]. One work-item per row. */
+/* Copy the same columns of row p of `packed` to row n + p of `values`. One work-item per row. */
 kernel void unpack_rows(const int size, const int n, global const uint *packed, const int words, const int row,
                         const int first, global uint *values)
 {

@@ -44,7 +44,7 @@ class Graph:
     weights : (m,) real
         Symmetric, >= 0.
     ghosts : Ghosts, optional
-        Who owns the cells of other parts, the columns from n on.
+        Owners of the cells of other parts, which have the columns from n on.
     """
 
     starts: cla.Array
@@ -78,7 +78,7 @@ class Aggregates:
     members : (n,) int32
         Aggregate g has the cells ``members[starts[g]:starts[g + 1]]``.
     ghosts : Ghosts, optional
-        Who owns the aggregates of other parts.
+        Owners of the aggregates of other parts.
     """
 
     aggregate: cla.Array

@@ -90,7 +90,7 @@ class Multigrid:
         weights : (m,) real
             Symmetric, >= 0. The arrays must not change while the levels are used.
         ghosts : Ghosts, optional
-            Who owns the columns from n on. All parts call this and `apply` together.
+            Owners of the columns from n on. All parts call this and `apply` together.
         """
         graph, peers = self._aggregation.scale(Graph(starts, columns, weights, ghosts), 0), self.engine.peers
         self._levels, self._factor, rest = [], None, None

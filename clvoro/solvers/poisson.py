@@ -93,7 +93,7 @@ class Laplacian:
 
     @property
     def ghosts(self) -> Ghosts | None:
-        """Who owns neighbors in other parts."""
+        """Owners of the neighbors in other parts."""
         return None if self.part is None else self.part.ghosts
 
 

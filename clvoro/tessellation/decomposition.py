@@ -81,11 +81,10 @@ def is_balanced(n: int, peers: Peers) -> bool:
 
 
 def distribute(engine: Engine, box: ClipBox, rows: dict) -> dict:
-    """Return `rows`, device arrays of generators by name, with the generators that this part owns from now on.
+    """Exchange generators, so that each part has those that it owns from now on, and return their arrays by name.
 
-    The arrays given are freed.
-
-    ``rows["points"]`` are in the device's coordinates in `box`. All parts call this together.
+    `rows` are the arrays before, on the device, and are freed. ``rows["points"]`` are in the device's coordinates in
+    `box`. All parts call this together.
     """
     peers = engine.peers
     lower, upper = (corner[: engine.dim].astype(float) for corner in box.device_corners(engine.real))

@@ -57,7 +57,7 @@ cells are beside ghosts."""
 GROUP = 64
 """Number of balls in a group, if they are around ghosts or another part has sent them."""
 FAILED = np.array([0.0, 0.0, 0.0, 0.0, 1.0])
-"""What a part without cells, since its update has failed, adds to `Part.sums`. The last number counts such parts."""
+"""Sums of a part whose update has failed: nothing to those of `Part.sums`, and one to the number of such parts."""
 
 
 class Chunks:
@@ -75,8 +75,6 @@ class Chunks:
         Generators along the curve.
     firsts : (k,) int
         Where the chunks begin in `order`.
-    place : (n,) int
-        Place of each generator in `order`.
     spacings : (n,) float
         For each generator the median distance of two successive ones in its chunk.
     """
@@ -92,8 +90,8 @@ class Chunks:
             usual = np.median(ways[firsts[:, None] + np.arange(n // count - 1)], axis=1)
             spacings = np.maximum(spacings, usual)
         spacings = np.repeat(spacings, np.diff(np.append(firsts, n)))
-        self.spacings, self.place = np.empty(n), np.empty(n, int)
-        self.spacings[self.order], self.place[self.order] = spacings, np.arange(n)
+        self.spacings = np.empty(n)
+        self.spacings[self.order] = spacings
         # Generators may have moved far from the others of their part.
         jumps = 1 + np.flatnonzero(ways > JUMP * spacings[:-1])
         self.firsts = np.unique(np.concatenate([firsts, jumps]))
@@ -212,7 +210,7 @@ class Answers:
         return int(sum(rows[:, 1].sum() for rows in self.new))
 
     def shrink(self) -> None:
-        """Make the balls smaller, until none of the given generators, which do not become ghosts, is within a skin."""
+        """Make the balls smaller, until the given generators, which do not become ghosts, are outside of the skins."""
         places, balls = np.concatenate([rows[:, 2:] for rows in self.new]), self.balls
         if len(places) and len(self.asked):
             tree = scipy.spatial.cKDTree(places)
@@ -232,7 +230,7 @@ def gaps(boxes: np.ndarray, others: np.ndarray) -> np.ndarray:
 
 
 def around(boxes: np.ndarray) -> np.ndarray:
-    """Return the box around `boxes` (k, 2 d), (1, 2 d)."""
+    """Return the box around all `boxes` (k, 2 d), (1, 2 d)."""
     dim = boxes.shape[1] // 2
     return np.concatenate([boxes[:, :dim].min(axis=0), boxes[:, dim:].max(axis=0)])[None]
 
@@ -528,6 +526,6 @@ class PartSteps(DomainSteps):
             places, to, gap = f.places[own], f.others[own], f.ways[own]
             np.minimum.at(ways, places[holds[to]], gap[holds[to]])
             np.minimum.at(rooms, places, np.maximum(skins[to], gap - np.maximum(largest[to], FREE * gap)))
-            rooms[chunks.place[self._sent[number]]] = np.inf
+            rooms[np.isin(chunks.order, self._sent[number])] = np.inf
             free, room = np.minimum(free, FREE * ways), np.minimum(room, rooms)
         return np.maximum(balls.radii[:n], free), room

@@ -26,7 +26,7 @@ from .polyhedra import Polyhedra
 from .stages import TessellationStages
 
 LATER_FROM = 10_000
-"""From this number of cells on, those of periodic images, if they are the larger part, wait until the halo is known."""
+"""The cells of periodic images wait until the halo is known, if most cells are images and there are so many cells."""
 Sort: TypeAlias = Callable[[], BinnedPoints]
 """Returns the generators in bins, and sorts them when it is first called."""
 
