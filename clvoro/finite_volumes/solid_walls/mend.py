@@ -65,12 +65,7 @@ def spoiled_near_walls(before: Faces, made: Faces) -> np.ndarray:
 def changed_cells(before: Faces, made: Faces, among: np.ndarray | None = None) -> np.ndarray:
     """Return which cells `collapse_short` has changed, (n,) bool.
 
-    Parameters
-    ----------
-    before, made : Faces
-        The mesh before and after it.
-    among : (n,) bool, optional
-        Only faces of these cells are compared; all by default.
+    It has turned the mesh `before` into `made`. Only faces of the cells `among` (n,) bool are compared, if given.
     """
     row = np.full(before.half_face.max() + 1, -1)
     row[before.half_face] = np.arange(len(before))

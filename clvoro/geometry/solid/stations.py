@@ -279,21 +279,10 @@ class _Crease(ChainOfChords):
 def _divide(
     line: Line, size: Callable[[np.ndarray], np.ndarray], ends: tuple[float, float], shortest: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Divide a line into chords that are about as long as the size `size` of cells there.
+    """Divide a line into chords about as long as the cells there; a line shorter than `shortest`, over h, has none.
 
-    Parameters
-    ----------
-    ends : (2,) float
-        Lengths of the first and the last chord, over the size there.
-    shortest : float
-        A line shorter than this, over the size there, has no chords.
-
-    Returns
-    -------
-    ends, middle : (n + 1,) and (n,) float
-        Lengths along the line at the ends of the chords, and in the middle of each.
-    h : (n,) float
-        Sizes of the cells around the chords.
+    Return the lengths along the line at the ends of the chords, (n + 1,), those in the middle of each, (n,), and the
+    sizes of the cells around them, (n,). The first and the last chord are longer by the factors `ends`.
     """
     total = float(line.at[-1])
     n = _FEWEST
