@@ -22,11 +22,6 @@ def shared_adapter() -> Adapter:
     """Return the adapter of `adapt` and `voronoi`, on the best device; it is created by the first call.
 
     It computes in float64, or in float32 if no device computes in float64.
-
-    Raises
-    ------
-    DeviceError
-        If no device works.
     """
     global _shared
     with _sharing:

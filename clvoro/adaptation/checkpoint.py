@@ -89,13 +89,7 @@ class Checkpointer:
         self._last = time.monotonic()
 
     def write(self, run: Run) -> None:
-        """Write the state of `run` between two actions. The file is replaced when the new one is complete.
-
-        Raises
-        ------
-        OutputError
-            If the file cannot be written.
-        """
+        """Write the state of `run` between two actions. The file is replaced when the new one is complete."""
         from ..io.arrays import write_arrays
 
         mesh, kept = run.state, run.state.arrays
@@ -289,13 +283,7 @@ class Saved:
             )
 
     def mesh(self, setup: Setup, schedule: list[Action]) -> MeshState:
-        """Return the mesh of the saved run, for a run with this `schedule`.
-
-        Raises
-        ------
-        InputError
-            If schedule or size field differ from those of the saved run.
-        """
+        """Return the mesh of the saved run, for a run with this `schedule`."""
         engine, a = setup.stages.engine, self.arrays
         self.peers.agree(lambda: self._compare(setup, schedule))
         on_device = {

@@ -359,12 +359,7 @@ def _warn_of_coarse_size(domain: Domain, required: float) -> None:
 def _estimate_memory(
     setup: Setup, options: Options, tree: DensityTree | None, required: float, most: int, levels: int
 ) -> float:
-    """Return the bytes that the run of at most `most` cells needs on the device.
-
-    Raises
-    ------
-    MemoryLimitError
-    """
+    """Return the bytes that the run of at most `most` cells needs on the device."""
     domain, sizing, engine, power = setup.domain, setup.sizing, setup.stages.engine, options.method == "transport"
     surplus, images, boundary = 0.0, None, None
     if options.multilevel and tree is not None:
@@ -414,13 +409,7 @@ def _is_narrow(setup: Setup, coarseness: float) -> bool:
 
 
 def start(prepared: Prepared) -> MeshState:
-    """Return the mesh of the initial generators: those of layers, then those of the caller or a random sample.
-
-    Warns
-    -----
-    PrecisionWarning
-        If positions do not resolve the sizes.
-    """
+    """Return the mesh of the initial generators: those of layers, then those of the caller or a random sample."""
     setup, rows, levels = prepared.setup, prepared.rows, prepared.levels
     domain, engine, fixed = setup.domain, setup.stages.engine, setup.points
     host = prepared.points if prepared.lattice is None else prepared.lattice

@@ -367,11 +367,6 @@ class MeshState:
         ----------
         rows : dict of device arrays
             The fields of `Generators`, removed from the dict. Memory is freed only if there is no other reference.
-
-        Raises
-        ------
-        SizeFieldError
-            If a size is not positive and finite.
         """
         stages, peers = self.stages, self.engine.peers
         if peers.count > 1 and (first or not is_balanced(len(rows["points"]), peers)):
@@ -402,13 +397,6 @@ class MeshState:
             There is no earlier diagram to compare neighbors with.
         binned : BinnedPoints, optional
             The points in their bins, if the caller has them.
-
-        Raises
-        ------
-        InputError
-            If generators are too close to each other to be distinct.
-        SizeFieldError
-            If a size is not positive and finite.
         """
         stages, data = self.stages, self._data
         data.weights = None

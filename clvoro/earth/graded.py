@@ -153,13 +153,7 @@ def _nodes(sphere: Sphere, nx: int, column: np.ndarray, row: np.ndarray) -> np.n
 
 @on_domain.register
 def on_sphere(domain: Sphere, field: Field) -> Field:
-    """Return `field` for a sphere: fields of two dimensions are functions of longitude and latitude.
-
-    Raises
-    ------
-    InputError
-        For a `Graded` field with a box.
-    """
+    """Return `field` for a sphere: fields of two dimensions are functions of longitude and latitude."""
     if isinstance(field, (Scaled, Combined)):
         return field.map_parts(lambda part: on_sphere(domain, part))
     if isinstance(field, Graded):

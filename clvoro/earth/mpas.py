@@ -174,13 +174,7 @@ ZONES = "bdyMaskCell"
 
 
 def write_mpas(contents: Contents, path: Path, unit: str = "m") -> None:
-    """Write the mesh with coordinates in `unit`. In a periodic box each edge and vertex at a seam exists once.
-
-    Raises
-    ------
-    InputError
-        If a cell has several loops of edges, or reaches half a period from its generator: MPAS uses nearest images.
-    """
+    """Write the mesh with coordinates in `unit`. In a periodic box each edge and vertex at a seam exists once."""
     _describe(contents, path, unit).write()
 
 

@@ -382,12 +382,6 @@ def load_netcdf(path: str | PathLike[str]) -> Result | Diagram:
 
     Neighbors, areas, arcs and centroids are computed from generators and corners. A UGRID file of a `Result` gives a
     `Result`; others give a `Diagram`.
-
-    Raises
-    ------
-    InputError
-        If the file is missing, damaged, of another format, of a mesh in the plane, or without generators; names the
-        file and the fault.
     """
     with explained(path, "a netCDF file"):
         with open_netcdf(path) as found:

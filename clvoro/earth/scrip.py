@@ -16,13 +16,7 @@ from ..io.netcdf import NetCDF
 
 
 def write_scrip(contents: Contents, path: Path, unit: str = "m") -> None:
-    """Write centers, corners and areas of the cells, and a mask of ones; `unit` has no meaning here.
-
-    Raises
-    ------
-    InputError
-        If the mesh is not on a sphere.
-    """
+    """Write centers, corners and areas of the cells, and a mask of ones; `unit` has no meaning here."""
     del unit
     diagram, domain = contents.diagram, contents.diagram.domain
     what = f"cannot write {path}: SCRIP files are for meshes on a Sphere"

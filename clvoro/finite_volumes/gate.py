@@ -69,14 +69,7 @@ OF_CONVEX = ("aspect_ratio", "non_orthogonality", "skewness", "determinant", "we
 
 
 def check_for_solver(diagram: Diagram, solver: Solver = "openfoam", walls: WallShape | None = None) -> SolverReport:
-    """Check `diagram`, as it is written for a solver, by that solver's criteria; see `Diagram.check`.
-
-    Raises
-    ------
-    InputError
-        If the solver is not known or has no meshes of such a domain, or `walls` is neither "straight" nor "exact", or
-        given for "mpas".
-    """
+    """Check `diagram`, as it is written for a solver, by that solver's criteria; see `Diagram.check`."""
     check_choice("solver", solver, tuple(SOLVERS))
     return SOLVERS[solver](diagram, walls)
 

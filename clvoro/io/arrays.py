@@ -52,13 +52,7 @@ def explained(path: str | PathLike[str], expected: str) -> Iterator[None]:
 def write_arrays(
     path: str | PathLike[str], kind: str, version: int, arrays: Mapping[str, object], compress: bool = True
 ) -> None:
-    """Write `arrays` by name, completely or not at all. Equal arrays give equal bytes.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be written.
-    """
+    """Write `arrays` by name, completely or not at all. Equal arrays give equal bytes."""
     method = zipfile.ZIP_DEFLATED if compress else zipfile.ZIP_STORED
     with (
         atomic_file(path) as file,
@@ -74,13 +68,7 @@ def write_arrays(
 
 
 def read_arrays(path: str | PathLike[str], kind: str, version: int) -> dict[str, np.ndarray]:
-    """Read all arrays that `write_arrays` wrote. Checksums cover every byte.
-
-    Raises
-    ------
-    InputError
-        If the file is missing, damaged, truncated, of another kind or of a newer version.
-    """
+    """Read all arrays that `write_arrays` wrote. Checksums cover every byte."""
     with explained(path, f"a {kind}"), open_plain(path) as file, zipfile.ZipFile(file) as archive:
         members = list_members(archive, kind, version)
         return {name: read_member(archive, info) for name, info in members.items()}

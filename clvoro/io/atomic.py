@@ -23,11 +23,6 @@ def check_writable(path: str | PathLike[str]) -> None:
     """Check before a long run that a file can be written to `path`, or to a folder `path`.
 
     A temporary file is created there and removed.
-
-    Raises
-    ------
-    OutputError
-        If that fails, with the reason.
     """
     path = Path(path)
     with writing(path):

@@ -49,11 +49,6 @@ def run_check_mesh(mesh: Result | Diagram, walls: WallShape = "straight") -> Che
     """Return the verdict of OpenFOAM's `checkMesh` on a mesh, or None if it is not installed.
 
     The mesh is written into a temporary case.
-
-    Raises
-    ------
-    InputError
-        If OpenFOAM cannot hold the mesh.
     """
     if shutil.which("checkMesh") is None:
         return None

@@ -143,13 +143,7 @@ def _disv_mesh(diagram: Diagram, walls: WallShape) -> Faces:
 
 
 def check_for_modflow(diagram: Diagram, walls: WallShape | None) -> SolverReport:
-    """Check `diagram` by the demands of MODFLOW 6 on DISV grids, and of its control-volume differences on cells.
-
-    Raises
-    ------
-    InputError
-        In 3D, on a sphere and in a periodic box.
-    """
+    """Check `diagram` by the demands of MODFLOW 6 on DISV grids, and of its control-volume differences on cells."""
     mesh = _disv_mesh(diagram, walls or "straight")
     around = around_islands(mesh)
     made = [around] if around is not None else _criteria(mesh)

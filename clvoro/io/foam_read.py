@@ -28,13 +28,7 @@ _PATCH = re.compile(r'"?([^\s"{}()]+)"?\s*\{([^{}]*)\}')
 
 
 def check_polymesh(folder: Path) -> SolverReport:
-    """Check the mesh in a folder ``polyMesh`` by the criteria of OpenFOAM's `checkMesh`.
-
-    Raises
-    ------
-    InputError
-        If a file is missing, damaged, or of another kind.
-    """
+    """Check the mesh in a folder ``polyMesh`` by the criteria of OpenFOAM's `checkMesh`."""
     with explained(folder, "the files points, faces, owner, neighbour and boundary"):
         return openfoam_report(_read_faces(folder))
 

@@ -58,13 +58,7 @@ class NetCDF:
     def add(
         self, name: str, dimensions: tuple[str, ...], values: np.ndarray, **attributes: str | np.generic | np.ndarray
     ) -> None:
-        """Add a variable of integers or real numbers.
-
-        Raises
-        ------
-        InputError
-            If the variable is too large for the format.
-        """
+        """Add a variable of integers or real numbers."""
         assert values.shape == tuple(self.dimensions[d] for d in dimensions), name
         self._add(name, _Variable(dimensions, values, attributes))
 
@@ -77,13 +71,7 @@ class NetCDF:
         missing: int,
         **attributes: str | np.generic,
     ) -> None:
-        """Add a table of ragged rows: row i has `counts[i]` of the `items`, then `missing`.
-
-        Raises
-        ------
-        InputError
-            If the variable is too large for the format.
-        """
+        """Add a table of ragged rows: row i has `counts[i]` of the `items`, then `missing`."""
         self._add(name, _Variable(dimensions, items, attributes, counts, missing))
 
     def add_extra(self, cells: str, **attributes: str) -> None:

@@ -187,11 +187,6 @@ def load_vtu(path: str | PathLike[str]) -> Result | Diagram:
 
     Domain, graph, volumes, sizes, errors and quality are those of the file. Other measures are computed again from the
     corners of the cells. The history is empty.
-
-    Raises
-    ------
-    InputError
-        If the file is missing, damaged, truncated or not from clvoro; names the file and the fault.
     """
     with explained(path, "a .vtu file that save wrote"):
         with open_plain(path) as file:

@@ -167,13 +167,7 @@ def make_array(
     data: cl.Buffer | None = None,
     offset: int = 0,
 ) -> DeviceArray:
-    """Return an array of `shape` at byte `offset` of `data`, or in a new buffer with arbitrary content.
-
-    Raises
-    ------
-    MemoryLimitError
-        If the device does not allocate so large a buffer.
-    """
+    """Return an array of `shape` at byte `offset` of `data`, or in a new buffer with arbitrary content."""
     if type(shape) is not tuple:
         shape = (int(shape),)  # type: ignore[arg-type]
     size = math.prod(shape)

@@ -218,13 +218,7 @@ def refuse_shared_gpus(peers: Peers, device: cl.Device) -> None:
 
 @cache
 def shared_context() -> cl.Context:
-    """Return one context on the default device for all that runs without an adapter, so that programs are built once.
-
-    Raises
-    ------
-    DeviceError
-        If no device works.
-    """
+    """Return the context of all that runs without an adapter, on the default device, so that programs are built once."""
     return create_context()
 
 

@@ -176,11 +176,6 @@ class Poisson:
         -------
         Laplacian
             Its weights, and columns of a part, are in the workspace and valid to the end of the present frame.
-
-        Raises
-        ------
-        InputError
-            If an array has the wrong shape.
         """
         engine = self.engine
         n = len(starts) - 1

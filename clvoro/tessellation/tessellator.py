@@ -104,11 +104,6 @@ class Tessellator:
             Make all that `final` needs: in a periodic box the cells of images as well.
         labels : (n,) int32, optional
             Permanent names of the generators, which parts of a domain need; a new array for other generators.
-
-        Raises
-        ------
-        InputError
-            If generators are too close to each other to be distinguished.
         """
 
         @cache
@@ -145,11 +140,6 @@ class Tessellator:
             With `previous`: None is returned as soon as a cell is known to be smaller.
         exact, complete : bool
             As for `tessellate`.
-
-        Raises
-        ------
-        InputError
-            If generators are too close to each other to be distinguished.
         """
         assert self.rings is not None
         with self._in_units(points, n):

@@ -173,13 +173,7 @@ class MongeAmpereMethod(Method):
     map: LatticeMap | None = field(default=None, repr=False)
 
     def step(self, mesh: MeshState) -> Displacement:
-        """Evaluate the displacement as the correction; `lloyd` is zero.
-
-        Warns
-        -----
-        TangledMeshWarning
-            If the map would fold.
-        """
+        """Evaluate the displacement as the correction; `lloyd` is zero."""
         if self.map is None:
             self.map = LatticeMap(mesh.domain, self.lattice)
         labels, (_, scale) = mesh.labels.get(), mesh.domain.frame

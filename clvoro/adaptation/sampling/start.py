@@ -89,13 +89,7 @@ def count_cells(field: Callable[[np.ndarray], np.ndarray] | float, domain: Domai
 
 
 def density_tree(field: Callable[[np.ndarray], np.ndarray] | float, domain: Domain) -> DensityTree:
-    """Return the tree for `sample_density`. Its integral is the number of cells, with an error of 0.1 %.
-
-    Raises
-    ------
-    SizeFieldError
-        If h is not positive and finite somewhere; names the place.
-    """
+    """Return the tree for `sample_density`. Its integral is the number of cells, with an error of 0.1 %."""
     chart, plane_field = charted(domain, _evaluator(field))
     return DensityTree(plane_field, chart, tolerance=_TOLERANCE)
 
@@ -132,13 +126,6 @@ def sample_density(
     -------
     (n, d) float64
         Physical coordinates, distinct and strictly inside, in the order of the curve.
-
-    Raises
-    ------
-    SizeFieldError
-        If h is not positive and finite somewhere; names the place.
-    InputError
-        If the precision has not `n` distinct points.
     """
     n, seed = _check_arguments(n, seed)
     field = _evaluator(field)
@@ -182,11 +169,6 @@ def sample_uniform(domain: Domain, n: int, seed: int, real: DTypeLike = np.float
     -------
     (n, d) float64
         Physical coordinates, distinct and strictly inside.
-
-    Raises
-    ------
-    InputError
-        If the precision has not `n` distinct points.
     """
     n, seed = _check_arguments(n, seed)
     chart = domain.chart()

@@ -196,13 +196,7 @@ def _files(node: Any) -> Iterator[tuple[dict[str, Any], str]]:
 
 
 def _check_walls(table: dict[str, Any], domain: Domain, place: str) -> None:
-    """Check all walls that a case names, and the types of patches.
-
-    Raises
-    ------
-    InputError
-        With the key, its value, and the names of the boundaries.
-    """
+    """Check all walls that a case names, and the types of patches."""
     for key, node in _tables({key: table[key] for key in ("size", "layers") if key in table}, place):
         if node.get("edges") is not None and (key.startswith(f"{place} layers") or node.get("kind") == "boundary"):
             domain.boundaries.select(f"{key}.edges", node["edges"])

@@ -56,11 +56,6 @@ def write_toml(table: Mapping[str, Any], header: Sequence[str] = ()) -> str:
     """Return `table` as TOML text, with the lines of `header` as comments above it.
 
     Reading it gives the same table, floats with all their digits. A list of numbers stands on one line.
-
-    Raises
-    ------
-    TypeError
-        For a value that TOML cannot represent.
     """
     lines = [f"# {line}".rstrip() for line in header]
     text = _FLAT.sub(lambda found: f"[{' '.join(found[1].split())[:-1]}]", tomli_w.dumps(table))

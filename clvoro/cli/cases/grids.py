@@ -34,11 +34,6 @@ def read_grid(path: Path, variable: str | None) -> Any:
     ----------
     variable : str or None
         Its name; by default the only one of two dimensions, besides those of length 1.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be read, or has no such variable or several.
     """
     if path.suffix.lower() == ".npz":
         return _from_npz(path, variable)

@@ -40,11 +40,6 @@ def fetch_diagram(engine: Engine, domain: Domain, t: Tessellation, labels: cla.A
     ----------
     copy : bool
         Copy the arrays of `t`. Without a copy the caller must not reuse these buffers.
-
-    Raises
-    ------
-    InputError
-        If round-off has made cells wrong.
     """
     if domain.curved_walls:
         from .solid import make_mesh, read_generators

@@ -50,11 +50,6 @@ def make_mesh(engine: Engine, domain: Solid, points: np.ndarray, sizes: np.ndarr
 
     In a run each cell is cut by planes of its own, and cells do not fit together. The mesh has the Voronoi cells of the
     same generators, cut at the surface. With `warns` the function warns of defects of the mesh.
-
-    Raises
-    ------
-    InputError
-        If round-off has made cells wrong, or the solid is too thin for the size of cells.
     """
     tell = engine.pool.on_work or (lambda _: None)
     tell("diagram of all cells")
