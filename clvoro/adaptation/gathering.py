@@ -21,7 +21,7 @@ _OF_CELLS = ("target_size", "size_error", "quality", "origin")
 
 @dataclass(frozen=True)
 class ResultParts:
-    """What `Result.gather` needs; see `clvoro.mesh.results.OtherParts`."""
+    """The other parts of a mesh, as the result of one of them sees them."""
 
     engine: Engine
     domain: Domain

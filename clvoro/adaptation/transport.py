@@ -47,7 +47,7 @@ def power_diagram_of(stages: Stages, domain: Domain, points: object, weights: ob
         assert t is not None
         t = power.final(t)
     diagram = fetch_diagram(power.stages.engine, domain, t, labels)
-    diagram = diagram.with_weights(given)
+    diagram = diagram.with_arrays(weights=given)
     empty = diagram.empty_cells
     if len(empty):
         warn(

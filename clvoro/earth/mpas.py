@@ -21,6 +21,7 @@ from ..io.contents import Contents
 from ..io.netcdf import NetCDF, squared
 from ..mesh.diagram import Diagram
 from ..mesh.half_faces import HalfEdges
+from ..mesh.straightening import cross
 from .criteria import coast_faults
 from .trisk import find_weights
 
@@ -150,7 +151,7 @@ def _in_plane(diagram: Diagram, halves: HalfEdges) -> Shape:
     lengths = diagram.face_measures[halves.rows[first]]
     distances = np.where(inner[first], np.hypot(*line[first].T), np.sqrt(3) * lengths)
     foot = np.where(inner[:, None], line / 2, middle)
-    kites = (_cross(begin, foot) + _cross(foot[halves.previous], begin)) / 2
+    kites = (cross(begin, foot) + cross(foot[halves.previous], begin)) / 2
     along = (end - begin)[first]
     outward = np.stack([along[:, 1], -along[:, 0]], axis=1)
     normals = np.where(inner[first][:, None], line[first], outward)
@@ -163,10 +164,6 @@ def _in_plane(diagram: Diagram, halves: HalfEdges) -> Shape:
         np.arctan2(normals[:, 1], normals[:, 0]),
         np.abs([begin, line]).max(axis=(0, 1)),
     )
-
-
-def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
 
 
 ZONES = "bdyMaskCell"

@@ -12,14 +12,13 @@ from typing import TYPE_CHECKING, Any
 
 from ..arguments import check_path
 from ..errors import InputError, InputTypeError
-from ..finite_volumes.solver_mesh import WallShape
 from ..mesh.diagram import Diagram
-from ..mesh.results import OtherParts, Result
+from ..mesh.results import Result
 from .atomic import check_writable, make_folder
 from .cgns import write_cgns
 from .contents import Contents
 from .convert import check_polygons, write_foreign, write_history, write_metis
-from .disv import Disv, DisvBoundary, make_disv
+from .disv import Disv, DisvBoundary
 from .foam import write_foam
 from .npz import load as load_npz
 from .npz import write_npz
@@ -28,26 +27,11 @@ from .vtu import write_pvtu, write_vtu
 from .vtu_read import load_vtu
 
 if TYPE_CHECKING:
-    import meshio
-    import pyvista
     from numpy.typing import ArrayLike
 
-    from .fipy_mesh import VoronoiMesh2D, VoronoiMesh3D
+    from ..adaptation.gathering import ResultParts
 
-__all__ = [
-    "Disv",
-    "DisvBoundary",
-    "check_writable",
-    "load",
-    "make_folder",
-    "save",
-    "to_disv",
-    "to_fipy",
-    "to_meshio",
-    "to_pyvista",
-    "write",
-    "write_history",
-]
+__all__ = ["Disv", "DisvBoundary", "check_writable", "load", "make_folder", "save", "write", "write_history"]
 
 CONVENTIONS: dict[str, Callable[[Contents, Path, str], None]] = {"ugrid": write_ugrid}
 """Writers of ``.nc`` files; `earth` adds those of its models."""
@@ -157,7 +141,7 @@ def write(
 
 
 def _write_foam_of_ranks(
-    mesh: Result, parts: OtherParts, path: Path, cell_data: Mapping[str, ArrayLike] | None, given: dict[str, Any]
+    mesh: Result, parts: ResultParts, path: Path, cell_data: Mapping[str, ArrayLike] | None, given: dict[str, Any]
 ) -> None:
     """Gather the mesh on rank 0, which writes it as a decomposed case: a processor has the cells of a rank."""
     whole, owners = parts.gather(mesh), parts.owners()
@@ -203,47 +187,3 @@ _OPTIONS = {
     ".vtu": ("walls",),
 }
 """Options of the writers that have some."""
-
-
-def to_disv(mesh: Result | Diagram, walls: WallShape = "straight") -> Disv:
-    """Return the grid of MODFLOW 6's DISV package; see `Diagram.to_disv`."""
-    return make_disv(Contents.of(mesh).diagram, walls)
-
-
-def to_fipy(mesh: Result | Diagram, walls: WallShape = "straight") -> VoronoiMesh2D | VoronoiMesh3D:
-    """Return a mesh of FiPy; see `Diagram.to_fipy`."""
-    diagram = Contents.of(mesh).diagram
-    diagram.demand_voronoi("to_fipy")
-    diagram.domain.require_flat(
-        "FiPy has cells in the plane and polyhedra",
-        "save as .nc, or use diagram.faces, which has arcs of great circles",
-    )
-    try:
-        from .fipy_mesh import make_fipy_mesh
-    except ModuleNotFoundError as error:
-        if error.name is None or error.name.split(".")[0] != "fipy":
-            raise
-        from .convert import missing
-
-        raise missing("FiPy", "solvers", "to_fipy()") from error
-    return make_fipy_mesh(diagram, walls)
-
-
-def to_meshio(mesh: Result | Diagram, cell_data: Mapping[str, ArrayLike] | None = None) -> meshio.Mesh:
-    """Return a mesh of meshio; see `Diagram.to_meshio`."""
-    from .convert import to_meshio
-
-    contents = Contents.of(mesh, cell_data)
-    contents.diagram.demand_cells("to_meshio")
-    return to_meshio(contents)
-
-
-def to_pyvista(
-    mesh: Result | Diagram, cell_data: Mapping[str, ArrayLike] | None = None, cut: bool = False
-) -> pyvista.UnstructuredGrid:
-    """Return an unstructured grid of PyVista; see `Diagram.to_pyvista`."""
-    from .convert import to_pyvista
-
-    contents = Contents.of(mesh, cell_data)
-    contents.diagram.demand_cells("to_pyvista")
-    return to_pyvista(contents, cut)

@@ -22,7 +22,9 @@ if TYPE_CHECKING:
     import meshio
     import pyvista
 
+    from ..finite_volumes.solver_mesh import WallShape
     from ..mesh.diagram import Diagram
+    from .fipy_mesh import VoronoiMesh2D, VoronoiMesh3D
 
 
 def missing(library: str, extra: str, what: str) -> MissingLibraryError:
@@ -37,11 +39,28 @@ def to_meshio(contents: Contents, with_data: bool = True) -> meshio.Mesh:
     except ModuleNotFoundError as error:
         raise missing("meshio", "formats", "to_meshio()") from error
     diagram = contents.diagram
+    diagram.demand_cells("to_meshio")
     blocks, rows = _BLOCKS[diagram.domain.cell_dim](diagram)
     data = cell_data(contents) if with_data else {}
     return meshio.Mesh(
         in_space(diagram.vertices), blocks, cell_data={name: [_known(v)[k] for k in rows] for name, v in data.items()}
     )
+
+
+def to_fipy(diagram: Diagram, walls: WallShape) -> VoronoiMesh2D | VoronoiMesh3D:
+    """Return a mesh of FiPy; see `Diagram.to_fipy`."""
+    diagram.demand_voronoi("to_fipy")
+    diagram.domain.require_flat(
+        "FiPy has cells in the plane and polyhedra",
+        "save as .nc, or use diagram.faces, which has arcs of great circles",
+    )
+    try:
+        from .fipy_mesh import make_fipy_mesh
+    except ModuleNotFoundError as error:
+        if error.name is None or error.name.split(".")[0] != "fipy":
+            raise
+        raise missing("FiPy", "solvers", "to_fipy()") from error
+    return make_fipy_mesh(diagram, walls)
 
 
 def to_pyvista(contents: Contents, cut: bool = False) -> pyvista.UnstructuredGrid:
@@ -51,6 +70,7 @@ def to_pyvista(contents: Contents, cut: bool = False) -> pyvista.UnstructuredGri
     except ModuleNotFoundError as error:
         raise missing("PyVista", "pyvista", "to_pyvista()") from error
     diagram = contents.diagram
+    diagram.demand_cells("to_pyvista")
     kind = KINDS[diagram.domain.cell_dim]
     ends, items = (kind.topology(diagram)[name] for name in kind.stream)
     starts = np.concatenate([[0], ends])

@@ -223,10 +223,6 @@ class Diagram(MeshOutput):
                 kind += f"{len(self.empty_cells)} empty of "
         return f"Diagram({kind}{len(self)} cells in {self.domain})"
 
-    def with_weights(self, weights: np.ndarray) -> Diagram:
-        """Return this power diagram with the `weights` (n,) that the caller gave, without round-off."""
-        return Diagram(self.domain, {**self._arrays, "weights": weights})
-
     @property
     def empty_cells(self) -> np.ndarray:
         """Rows of cells without volume: none in a Voronoi diagram, (k,) int."""

@@ -548,9 +548,10 @@ class MeshOutput:
         InputError, InputTypeError
             If `cell_data` does not fit the cells.
         """
-        from ..io import to_pyvista
+        from ..io.contents import Contents
+        from ..io.convert import to_pyvista
 
-        return to_pyvista(self._self, cell_data, cut)
+        return to_pyvista(Contents.of(self, cell_data), cut)
 
     def to_meshio(self, cell_data: Mapping[str, ArrayLike] | None = None) -> meshio.Mesh:
         """Return the cells in a box, a polygon or a solid, or on a sphere as a mesh of meshio.
@@ -573,9 +574,10 @@ class MeshOutput:
         InputError, InputTypeError
             As for `to_pyvista`.
         """
-        from ..io import to_meshio
+        from ..io.contents import Contents
+        from ..io.convert import to_meshio
 
-        return to_meshio(self._self, cell_data)
+        return to_meshio(Contents.of(self, cell_data))
 
     def to_disv(self, walls: WallShape = "straight") -> Disv:
         """Return the cells in a box or a polygon in 2D as a grid for MODFLOW 6's DISV package, as FloPy takes it.
@@ -609,9 +611,9 @@ class MeshOutput:
         >>> river.cells.tolist(), river.conductance(0.01).tolist()
         ([1], [0.02])
         """
-        from ..io import to_disv
+        from ..io.disv import make_disv
 
-        return to_disv(self._self, walls)
+        return make_disv(self._diagram, walls)
 
     def to_fipy(self, walls: WallShape = "straight") -> VoronoiMesh2D | VoronoiMesh3D:
         """Return the cells in a box, also a periodic one, in a polygon or in a solid as a mesh of FiPy.
@@ -638,6 +640,6 @@ class MeshOutput:
         InputError
             On a sphere, for a cell that borders on its own periodic image, and in 2D for a cell around an island.
         """
-        from ..io import to_fipy
+        from ..io.convert import to_fipy
 
-        return to_fipy(self._self, walls)
+        return to_fipy(self._diagram, walls)

@@ -56,7 +56,7 @@ class Measures:
     volume_ratio: np.ndarray
     faces: np.ndarray
     inner: np.ndarray
-    diagram: Diagram | None = field(default=None, compare=False)
+    diagram: Diagram = field(compare=False)
 
     @cached_property
     def exact(self) -> SolverMeasures:
@@ -64,13 +64,11 @@ class Measures:
 
         Among them `shortest_edge` and `smallest_face` relative to the size of the cell; `summary()` has percentiles.
         """
-        assert self.diagram is not None
         return self.diagram.solver_mesh("exact", collapse=False).measures
 
     @cached_property
     def solver(self) -> SolverMeasures:
         """The same of the mesh that a solver gets: with straight walls, without short edges; see `solver_mesh`."""
-        assert self.diagram is not None
         return self.diagram.solver_mesh().measures
 
     @cached_property
@@ -81,7 +79,6 @@ class Measures:
         """
         from ..earth.c_grid import measure_c_grid
 
-        assert self.diagram is not None
         return measure_c_grid(self.diagram)
 
     def __repr__(self) -> str:
@@ -112,12 +109,12 @@ class Measures:
         `skewness` in a polygonal domain, whose walls may have generators behind them. On a sphere those of `c_grid`
         follow.
         """
-        domain = None if self.diagram is None else self.diagram.domain
-        of_c_grid = self.c_grid.summary() if domain is not None and domain.for_c_grids else {}
+        domain = self.diagram.domain
+        of_c_grid = self.c_grid.summary() if domain.for_c_grids else {}
         angle, ratio = (
             values[self.inner] if self.inner.any() else values for values in (self.centroid_angle, self.volume_ratio)
         )
-        cut = domain is not None and domain.cuts_cells and self.inner.any()
+        cut = domain.cuts_cells and self.inner.any()
         skewness = self.skewness[self.inner] if cut else self.skewness
         return {
             "mean_faces": float(self.faces.mean()),

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Protocol, overload
+from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from .read_only import Sealed
 from .straightening import have_corners
 
 if TYPE_CHECKING:
+    from ..adaptation.gathering import ResultParts
     from ..finite_volumes.gate import Solver, SolverReport
     from ..finite_volumes.solver_mesh import WallShape
     from .check.findings import Report
@@ -42,37 +43,6 @@ HISTORY_DTYPE = np.dtype(
     ]
 )
 """Columns of the history: one row per step, and one more if cells or target sizes have changed after the last step."""
-
-
-class OtherParts(Protocol):
-    """The other parts of a mesh, as a `Result` of one of them sees them."""
-
-    @property
-    def number(self) -> int:
-        """Number of this part."""
-        ...
-
-    @property
-    def count(self) -> int:
-        """Number of parts."""
-        ...
-
-    @property
-    def labels(self) -> np.ndarray:
-        """Permanent numbers of the cells of this part, (n,) int32, ascending, as in the whole mesh."""
-        ...
-
-    def gather(self, result: Result) -> Result | None:
-        """See `Result.gather`."""
-        ...
-
-    def owners(self) -> np.ndarray:
-        """Return on part 0 which part owns each cell of the whole mesh, (n,) int; on others an empty array."""
-        ...
-
-    def together(self, work: Callable[[], None]) -> None:
-        """Call `work` in all parts. An error in one of them is raised in all."""
-        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,7 +109,7 @@ class Result(Sealed, MeshOutput):
         Index of each generator in the points with which the run began, of a fixed one that of the point whose place it
         has taken; -1 for inserted generators, which come last. All are -1 if a random start has replaced the points,
         because their cells were far from the target sizes.
-    parts : OtherParts or None
+    parts : ResultParts or None
         Over the ranks of MPI: what `gather` needs. The arrays above are then those of the cells of this rank, and faces
         towards the cells of rank K are on a wall called ``"rankK"``, such as ``"rank1"``.
     """
@@ -157,7 +127,7 @@ class Result(Sealed, MeshOutput):
     size_factor: float = 1.0
     settings: dict[str, Any] = field(default_factory=dict)
     origin: np.ndarray | None = None
-    parts: OtherParts | None = None
+    parts: ResultParts | None = None
 
     def gather(self) -> Result | None:
         """Return the mesh of all ranks on rank 0, with rows in the order of generators, and None on the others.

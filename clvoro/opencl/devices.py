@@ -218,7 +218,7 @@ def refuse_shared_gpus(peers: Peers, device: cl.Device) -> None:
 
 @cache
 def shared_context() -> cl.Context:
-    """Return the context of all that runs without an adapter, on the default device, so that programs are built once."""
+    """Return the context on the default device of all that runs without an adapter: programs are built once."""
     return create_context()
 
 

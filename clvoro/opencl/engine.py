@@ -240,10 +240,7 @@ class Engine:
         """
         group = fit_group(kernel, group or ITEM_GROUP)
         bind(kernel, args)
-        items = (size + group - 1) // group * group if size > 0 else group
-        if self._divides:
-            return enqueue_ranges(self.queue, kernel, items, group, range_of(kernel))
-        return cl.enqueue_nd_range_kernel(self.queue, kernel, (items,), (group,))
+        return self.enqueue(kernel, (size + group - 1) // group * group if size > 0 else group, group)
 
     def enqueue(self, kernel: cl.Kernel, items: int, group: int) -> cl.Event:
         """Enqueue `kernel`, with its arguments set, over `items` work-items: whole work-groups of `group` items.

@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike
 from ..arguments import format_point
 from ..errors import InputError
 from ..geometry.domain import Domain, images_in
+from ..mesh.connectivity import following
 from ..mesh.diagram import Diagram
 from ..mesh.results import Result
 from .colors import COLORINGS, Color, Paint, paint_of, picture_of
@@ -329,9 +330,7 @@ def edge_widths(ax: Any, polygons: Sequence[np.ndarray]) -> np.ndarray:
     starts = np.concatenate([[0], np.cumsum([len(p) for p in polygons])])
     corners = np.concatenate(polygons)
     corners = corners - np.repeat(corners[starts[:-1]], np.diff(starts), axis=0)
-    ahead = np.arange(1, len(corners) + 1)
-    ahead[starts[1:] - 1] = starts[:-1]
-    (x, y), (u, v) = corners.T, corners[ahead].T
+    (x, y), (u, v) = corners.T, corners[following(starts)].T
     area = 0.5 * np.abs(np.add.reduceat(x * v - y * u, starts[:-1]))
     around = np.add.reduceat(np.hypot(u - x, v - y), starts[:-1])
     width = 4 * area / np.where(around > 0, around, 1)

@@ -238,7 +238,7 @@ def test_files_pictures_and_other_libraries(ctx, tmp_path):
     assert loaded.check()
     assert loaded.weights.tolist() == full.weights.tolist()
     assert "weights[3] is nan" in str(
-        full.with_weights(np.where(np.arange(len(full)) == 3, np.nan, full.weights)).check()
+        full.with_arrays(weights=np.where(np.arange(len(full)) == 3, np.nan, full.weights)).check()
     )
     full.to_openfoam(tmp_path / "polyMesh", check=False)
     # Dual triangles cover the same part of the plane, counter-clockwise.

@@ -9,6 +9,7 @@ import scipy
 import shapely
 
 from ...geometry.polygon import BOUNDARY_SHIFTS
+from ..connectivity import following
 
 if TYPE_CHECKING:
     from ...geometry.polygon import Polygon
@@ -24,21 +25,18 @@ cannot follow it exactly (in its own unit, which is up to twice the size of the 
 def check_outlines(check: Check) -> None:
     """Check that faces form loops, and that the corners of a cell follow the loops, with bridges there and back."""
     d = check.diagram
-    owner, ends, following = d.half_faces.owner, d.half_faces.ends, d.half_faces.next
+    owner, ends, onward = d.half_faces.owner, d.half_faces.ends, d.half_faces.next
     check.note(
         "faces closed",
-        ends[:, 1] != ends[following, 0],
+        ends[:, 1] != ends[onward, 0],
         lambda f: f"face {f} of cell {owner[f]} ends in vertex {ends[f, 1]}, where no face of it begins",
     )
     corners, starts = d.cell_vertices, d.cell_vertex_starts
-    places = np.arange(1, len(corners) + 1)
-    filled = starts[1:] > starts[:-1]
-    places[starts[1:][filled] - 1] = starts[:-1][filled]
     cell = np.repeat(np.arange(len(d)), np.diff(starts))
     # Count each way from vertex to vertex, minus the ways back: the two ways of a bridge cancel.
     of = np.concatenate([owner, cell])
     a = np.concatenate([ends[:, 0], corners])
-    b = np.concatenate([ends[:, 1], corners[places]])
+    b = np.concatenate([ends[:, 1], corners[following(starts)]])
     times = np.repeat([1, -1], [len(owner), len(cell)]) * np.sign(b - a)
     order = np.lexsort((np.maximum(a, b), np.minimum(a, b), of))
     new = np.zeros(len(order), bool)

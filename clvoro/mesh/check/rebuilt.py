@@ -187,11 +187,9 @@ class Rebuilt:
         at, x = d.points[self.owner], d.vertices
         face = np.repeat(np.arange(len(self.owner)), np.diff(d.face_vertex_starts))
         first = d.face_vertex_starts[:-1][face]
-        following = np.arange(1, len(face) + 1)
-        last = np.flatnonzero(np.diff(face, append=-1))
-        following[last] = first[last]
+        after = following(d.face_vertex_starts)
         a = x[d.face_vertices] - at[face]
-        b = x[d.face_vertices[following]] - at[face]
+        b = x[d.face_vertices[after]] - at[face]
         o = x[d.face_vertices[first]] - at[face]
         triangle = np.cross(a - o, b - o) / 2
         m = len(self.owner)
@@ -203,8 +201,8 @@ class Rebuilt:
         sums = np.stack([np.bincount(face, moment[:, k], m) for k in range(3)], axis=1)
         self.middles = np.where((total > 0)[:, None], sums / np.where(total > 0, total, 1)[:, None], 0.0)
         self.cells, self.corners = self.owner[face], d.face_vertices
-        self.edges = (face, d.face_vertices, d.face_vertices[following])
-        self._tails, self._edge, self._before = a, b - a, np.argsort(following)
+        self.edges = (face, d.face_vertices, d.face_vertices[after])
+        self._tails, self._edge, self._before = a, b - a, np.argsort(after)
 
     def _find_adopted(self, d: Diagram) -> None:
         """Set `adopted`, and the directions of adopted faces."""
