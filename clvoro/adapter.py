@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import dataclasses
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from os import PathLike
-from typing import TYPE_CHECKING, Literal, NoReturn
+from typing import TYPE_CHECKING, Any, Literal, NoReturn
 
 import numpy as np
 import pyopencl as cl
@@ -17,16 +19,17 @@ from .adaptation.options import (
     EffortName,
     MethodName,
     MultilevelOptions,
+    Options,
     PaperOptions,
     Start,
     merged_options,
 )
 from .adaptation.preparation import prepare
-from .adaptation.run import Run, check_run, check_shared
+from .adaptation.run import INTERRUPTED, Run, check_run, check_shared
 from .adaptation.stages import Stages
 from .adaptation.transport import RELAXED, power_diagram_of, transport_to
 from .arguments import check_choice, check_integer, check_points, coincident_named
-from .errors import InputError, InputTypeError, MemoryLimitError
+from .errors import InputError, InputTypeError, Interrupted, MemoryLimitError
 from .geometry.boundary_layers import Layers
 from .geometry.domain import Domain
 from .mesh.diagram import Diagram
@@ -37,6 +40,7 @@ from .opencl.engine import Engine
 from .opencl.peers import ALONE, Peers, peers_of
 from .opencl.prebuild import renew
 from .opencl.probe import check_process
+from .opencl.threads import Team, Threads
 from .tessellation.readback.diagram import make_diagram
 
 if TYPE_CHECKING:
@@ -44,7 +48,7 @@ if TYPE_CHECKING:
 
 
 class Adapter:
-    """Adapts Voronoi meshes on one device.
+    """Adapts Voronoi meshes on one device, or on several together.
 
     An adapter builds kernels when it first needs them, and keeps them and its device memory. Calls from several threads
     wait for each other. A process that was forked after the first use of OpenCL cannot use it (`DeviceError`); spawn
@@ -62,11 +66,21 @@ class Adapter:
         domain is a box with walls; "transport", moving meshes, layers and fixed generators are refused. Without `ctx`
         the ranks of a node take its GPUs in turn.
     share_gpus : bool
-        Whether several ranks may have one GPU. Otherwise this raises an `InputError`.
+        Whether several ranks may have one GPU, or `devices` the same one several times. Otherwise this raises an
+        `InputError`.
+    devices : list of str, pyopencl.Device or pyopencl.Context, optional
+        Share runs among these devices of this machine, in place of `ctx` and `comm`. Names are those that
+        `clvoro.create_context` takes; a name that is given several times stands for equally good devices in turn. Each
+        device makes the cells of a part of the generators, in a thread of its own, which also calls size functions.
+        `run` returns the whole mesh, as the first device holds it, and refuses what is refused with `comm`. All other
+        methods use the first device.
 
     Attributes
     ----------
     ctx, queue : pyopencl.Context, pyopencl.CommandQueue
+        Those of the first device.
+    devices : tuple of pyopencl.Device
+        All that share a run of this process.
     dtype : numpy.dtype
     on_memory : callable, optional
         Called by a run, before it begins, with the bytes that it needs on the device; see `memory_needed`.
@@ -98,6 +112,7 @@ class Adapter:
         dtype: Literal["float64", "float32"] | DTypeLike = "float64",
         comm: object = None,
         share_gpus: bool = False,
+        devices: Sequence[str | cl.Device | cl.Context | None] | None = None,
     ) -> None:
         try:
             real = np.dtype(dtype)  # type: ignore[arg-type]
@@ -111,6 +126,13 @@ class Adapter:
                 "clvoro.create_context(device), with a device or a part of its name"
             )
         check_process()
+        contexts = []
+        if devices is not None:
+            if ctx is not None or comm is not None:
+                raise InputError(
+                    f"devices and {'ctx' if comm is None else 'comm'} are given, expected one of them; leave one out"
+                )
+            ctx, *contexts = device.contexts_of(devices, real, share_gpus)
         self._peers = peers_of(comm)
         place = device.place_on_node(self._peers)
         self.ctx = self._peers.agree(lambda: device.context_of(ctx, real, place))
@@ -125,9 +147,17 @@ class Adapter:
         self.on_memory: Callable[[float], object] | None = None
         self.on_build: Callable[[int, int], object] | None = None
         self.on_work: Callable[[str], object] | None = None
+        self._others = [Adapter(other, real) for other in contexts]
+        self.devices = tuple(adapter.ctx.devices[0] for adapter in (self, *self._others))
+        self._team = Team(1 + len(contexts))
+        if contexts:
+            for adapter, peers in zip((self, *self._others), self._team.peers, strict=True):
+                adapter._peers = peers
+            self._peers.gathers = True
 
     def __repr__(self) -> str:
-        return f"Adapter({self.dtype.name} on {self.queue.device.name.strip()})"
+        more = f" and {len(self._others)} more" if self._others else ""
+        return f"Adapter({self.dtype.name} on {self.queue.device.name.strip()}{more})"
 
     def __reduce__(self) -> NoReturn:
         raise InputTypeError(
@@ -502,22 +532,64 @@ class Adapter:
         check_choice("on_interrupt", on_interrupt, ("raise", "return"))
         check_run(domain, size, callback)
         with self._alone():
-            for kept in self._stages.values():
-                kept.release()  # buffers of a diagram, or of a failed run, are not part of this run's memory
-            stages = self._stages_for(domain, self._peers)
-            if self._peers.shared:
-                check_shared(domain, merged, fixed)
-            with report_builds(stages.engine, self.on_build) as notice:
-                shown = self._shown(callback, notice)
-                stages.engine.pool.on_work = self.on_work
-                try:
-                    run = Run(stages, domain, size, own, fixed, merged, checkpoint, shown, self.on_memory)
-                    return run.conclude(on_interrupt)
-                except BaseException as error:
-                    self._peers.fail(error)
-                    raise
-                finally:
-                    stages.engine.pool.on_work = None
+            given = domain, size, own, fixed, merged, checkpoint
+            run = self._run_together if self._others else self._run
+            return run(*given, callback=callback, on_interrupt=on_interrupt)
+
+    def _run(
+        self,
+        domain: Domain,
+        size: object,
+        points: ArrayLike | None,
+        fixed: ArrayLike | None,
+        options: Options,
+        checkpoint: str | PathLike[str] | Checkpoint | None,
+        *,
+        callback: Callable[[np.void], object] | None,
+        on_interrupt: Literal["raise", "return"],
+    ) -> Result:
+        """Do what `run` does, with arguments that are checked, on this device."""
+        for kept in self._stages.values():
+            kept.release()  # buffers of a diagram, or of a failed run, are not part of this run's memory
+        stages = self._stages_for(domain, self._peers)
+        if self._peers.shared:
+            check_shared(domain, options, fixed)
+        with report_builds(stages.engine, self.on_build) as notice:
+            shown = self._shown(callback, notice)
+            stages.engine.pool.on_work = self.on_work
+            try:
+                run = Run(stages, domain, size, points, fixed, options, checkpoint, shown, self.on_memory)
+                return run.conclude(on_interrupt)
+            except BaseException as error:
+                self._peers.fail(error)
+                raise
+            finally:
+                stages.engine.pool.on_work = None
+
+    def _run_together(
+        self, *given: Any, callback: Callable[[np.void], object] | None, on_interrupt: Literal["raise", "return"]
+    ) -> Result:
+        """Do the same on all devices, and return the whole mesh."""
+        for other in self._others:
+            other.on_build = lambda *_: None
+
+        def work(peers: Threads) -> Result | None:
+            def answer(row: np.void) -> object:
+                if peers.number == 0 and callback is not None and peers.ask(partial(callback, row)):
+                    return True
+                return peers.team.interrupted
+
+            adapter = (self, *self._others)[peers.number]
+            return adapter._run(*given, callback=answer, on_interrupt=on_interrupt).gather()
+
+        result = self._team.run(work)[0]
+        assert result is not None
+        if not self._team.interrupted:
+            return result
+        result = dataclasses.replace(result, converged=False, stop_reason=INTERRUPTED)
+        if on_interrupt == "raise":
+            raise Interrupted(result)
+        return result
 
     def start(
         self,
@@ -567,7 +639,9 @@ class Adapter:
         merged, own = merged_options(points, options, method=method, **given)
         check_run(domain, size, None)
         if self._peers.shared:
-            raise InputError("start is called with an Adapter that has comm, expected run: ranks share whole runs")
+            raise InputError(
+                "start is called with an Adapter that has comm or devices, expected run: they share whole runs"
+            )
         stages = Stages(self._engine_for(domain))
         with self._at_work(stages):
             shown = self._shown(None, None)
@@ -589,7 +663,7 @@ class Adapter:
         layers: Layers | Sequence[Layers] = (),
         options: MultilevelOptions | PaperOptions | None = None,
     ) -> float:
-        """Estimate the bytes that `run` needs on the device with these arguments.
+        """Estimate the bytes that `run` needs on the device, or on each of several, with these arguments.
 
         A run of some thousand cells needs at most a quarter more, and no less than three quarters of it. Where sizes
         change several-fold from one cell to the next it may need half of it. The estimate includes reading all arrays
@@ -618,6 +692,6 @@ class Adapter:
         """
         merged, own = merged_options(points, options, method=method, n_cells=n_cells, layers=layers)
         with self._alone():
-            stages = self._stages_for(domain)
+            stages = self._stages_for(domain, self._peers)
             host = None if own is None else check_points(own, domain)
             return prepare(stages, domain, size, host, merged).memory

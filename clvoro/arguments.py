@@ -7,6 +7,7 @@ import sys
 import warnings
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from contextvars import ContextVar
 from os import fsdecode, fsencode, fspath
 from typing import TYPE_CHECKING
 
@@ -17,9 +18,15 @@ from .errors import InputError, InputTypeError
 if TYPE_CHECKING:
     from .geometry.domain import Domain
 
+WARNING: ContextVar[Callable[[str, type[Warning]], object] | None] = ContextVar("WARNING", default=None)
+"""What gives the warnings of this thread in place of `warn`."""
+
 
 def warn(message: str, category: type[Warning]) -> None:
-    """Warn at the line outside of clvoro from which its function was called."""
+    """Warn at the line outside of clvoro from which its function was called, or as `WARNING` says."""
+    if (other := WARNING.get()) is not None:
+        other(message, category)
+        return
     frame, level = sys._getframe(1), 2
     package = __name__.partition(".")[0]
     while frame.f_back and frame.f_globals.get("__name__", "").partition(".")[0] == package:

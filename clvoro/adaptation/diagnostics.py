@@ -197,7 +197,7 @@ def warn_of_other_sizes(result: Result) -> None:
     ratio = f"{float(f'{np.median(result.diagram.volumes ** (1 / dim) / result.target_size):.2g}'):g}"
     warn(
         f"mean |e| is {mean:.3g}: the cells have {ratio} times the sizes of the size field, as method "
-        f"{result.settings['method']!r} keeps {len(result)} cells; use the field times {ratio}, or "
+        f"{result.settings['method']!r} keeps {result.history['cells'][-1]} cells; use the field times {ratio}, or "
         "method='adaptive', which makes as many cells as the field requires",
         SizeErrorWarning,
     )

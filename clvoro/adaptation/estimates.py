@@ -7,10 +7,12 @@ from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
+import pyopencl as cl
 
-from ..errors import MemoryLimitError
+from ..errors import DeviceError, MemoryLimitError
 from ..geometry.domain import Domain
 from ..opencl import memory_limits
+from ..opencl.devices import create_context
 from ..opencl.engine import Engine
 from ..opencl.memory_limits import available_memory, host_memory, in_bytes
 from ..opencl.workspace import KEPT
@@ -171,7 +173,7 @@ def check_memory(
         "Do h and the domain have the same unit of length? If so, use a larger size, n_cells, dtype='float32' or "
         "another device"
     )
-    remedy += " for each rank, or more ranks" * engine.peers.shared
+    remedy += " for each part of the mesh, or more ranks or devices" * engine.peers.shared
     if needed > available:
         raise MemoryLimitError(
             f"the size field requires {n:.3g} cells, which need {in_bytes(needed)} on the device; {name} has "
@@ -183,6 +185,27 @@ def check_memory(
             f"at most {in_bytes(most)} for one array. {remedy}"
         )
     return needed
+
+
+def holder_of_all(engine: Engine, n: float, domain: Domain) -> Engine:
+    """Return an engine whose device holds the mesh of all parts, of `n` cells: the device of `engine`, else a CPU.
+
+    Raises
+    ------
+    MemoryLimitError
+        If neither does.
+    """
+    alone = engine.alone()
+    try:
+        check_memory(alone, n, domain, run=False)
+    except MemoryLimitError as error:
+        try:
+            ctx = create_context("cpu", fp64=engine.real == np.float64)
+        except DeviceError:
+            raise error from None
+        alone = Engine(ctx, cl.CommandQueue(ctx), engine.dim, engine.real, engine.traits)
+        check_memory(alone, n, domain, run=False)
+    return alone
 
 
 def check_prisms(count: float) -> None:

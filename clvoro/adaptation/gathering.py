@@ -13,7 +13,7 @@ from ..geometry.domain import Domain
 from ..mesh.results import Result
 from ..opencl.engine import Engine
 from ..tessellation.readback.parts import CellRows
-from .estimates import check_memory
+from .estimates import holder_of_all
 
 _OF_CELLS = ("target_size", "size_error", "quality", "origin")
 """Arrays of a result with one row per cell."""
@@ -61,7 +61,7 @@ class ResultParts:
         Raises
         ------
         MemoryLimitError
-            On part 0, if its device has not enough memory.
+            On part 0, if neither its device nor a CPU has enough memory.
         """
         peers = self.engine.peers
         rows, labels = self.rows.gather(peers), peers.collect(self.labels)
@@ -69,8 +69,7 @@ class ResultParts:
         if rows is None:
             return None
         order = np.argsort(np.concatenate(labels), kind="stable")
-        engine = self.engine.alone()
-        check_memory(engine, len(order), self.domain, run=False)
+        engine = holder_of_all(self.engine, len(order), self.domain)
         diagram = rows.diagram(engine, self.domain)
         arrays = {name: np.concatenate(values)[order] for name, values in found.items()}
         return dataclasses.replace(result, points=diagram.points, diagram=diagram, parts=None, **arrays)

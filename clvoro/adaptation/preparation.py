@@ -28,7 +28,7 @@ from ..sizing import Sizing, as_field
 from ..sizing.distance import before_layers, limit_beside_borders, limit_beside_layers
 from ..sizing.field import Field, on_domain
 from .diagnostics import check_precision, warn_of_mismatches, warn_of_narrow_parts
-from .estimates import SAMPLE, Extras, check_memory, check_prisms, expected_images, expected_surplus
+from .estimates import SAMPLE, Extras, check_memory, check_prisms, expected_images, expected_surplus, holder_of_all
 from .fixed_points import check_beside_borders, check_room, place_in_corners
 from .methods import MOVING, Relaxation, make_method
 from .moving.lattice import lattice_points
@@ -375,6 +375,8 @@ def _estimate_memory(
     exact = options.method == "exact"
     extras = Extras(images, surplus, field_bytes, boundary)
     needed = check_memory(engine, most, domain, extras, power=power, exact=exact)
+    if engine.peers.gathers:
+        holder_of_all(engine, most, domain)
     # For few cells, the preparation may have taken more than the run.
     return max(needed, float(sizing.peak_bytes))
 

@@ -72,7 +72,7 @@ def check_run(domain: object, size: object, callback: Callable[[np.void], object
 
 
 def check_shared(domain: Domain, options: Options, fixed: object) -> None:
-    """Raise if ranks cannot share such a run."""
+    """Raise if ranks or devices cannot share such a run."""
     what = ""
     if not domain.may_have_parts:
         what = f"domain is {domain!r:.80}, expected a Box with walls, without lines or surfaces inside"
@@ -81,7 +81,7 @@ def check_shared(domain: Domain, options: Options, fixed: object) -> None:
     elif options.layers or fixed is not None:
         what = "layers or fixed generators are given, expected none of them"
     if what:
-        raise InputError(f"{what}, since ranks share the run; use an Adapter without comm")
+        raise InputError(f"{what}, since ranks or devices share the run; use an Adapter without comm and devices")
 
 
 class Run:

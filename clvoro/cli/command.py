@@ -96,8 +96,14 @@ def _add_run(commands: Any) -> None:
 
 
 def _add_settings(run: Any) -> None:
-    run.add_argument("--device", metavar="NAME", help="gpu, cpu, part of a name, or PLATFORM:DEVICE indices")
-    run.add_argument("--share-gpus", action="store_true", help="under mpiexec: let several ranks use one GPU")
+    run.add_argument(
+        "--device",
+        metavar="NAME",
+        help="gpu, cpu, part of a name, or PLATFORM:DEVICE indices; several, as 0:0,0:1, share the run",
+    )
+    run.add_argument(
+        "--share-gpus", action="store_true", help="let several ranks use one GPU, or the run one device several times"
+    )
     run.add_argument(
         "--method",
         metavar="M",

@@ -61,7 +61,7 @@ class Job:
     out : Path
         Folder for the files; created if needed.
     device : str or None
-        As `clvoro.create_context` takes it.
+        As `clvoro.create_context` takes it; several, with commas between them, share the run.
     report : bool
         Whether to draw pictures and write `report.html`.
     mesh_formats : tuple of str
@@ -134,7 +134,8 @@ class Job:
         adapter = self.peers.agree(self._make_adapter)
         device = adapter.ctx.devices[0]
         where = f"{device.platform.name.strip()} / {device.name.strip()}"
-        where += f" and {self.peers.count - 1} more" * (self.peers.count > 1)
+        more = max(self.peers.count, len(adapter.devices)) - 1
+        where += f" and {more} more" if more else ""
         results: dict[str, Result] = {}
         profiles: dict[str, Profile] = {}
         with self._stopping_cleanly():
@@ -194,7 +195,9 @@ class Job:
     def _make_adapter(self) -> Any:
         from .. import Adapter, create_context
 
-        dtype = self.case.run.get("dtype", "float64")
+        dtype, names = self.case.run.get("dtype", "float64"), (self.device or "").split(",")
+        if len(names) > 1:
+            return Adapter(dtype=dtype, devices=names, share_gpus=self.share_gpus)
         context = create_context(self.device, fp64=dtype == "float64", comm=self.peers)
         return Adapter(context, dtype, self.peers, self.share_gpus)
 

@@ -138,6 +138,38 @@ def context_of(ctx: cl.Context | None, real: np.dtype, place: int) -> cl.Context
     return found
 
 
+def contexts_of(
+    devices: Sequence[str | cl.Device | cl.Context | None], real: np.dtype, may_share: bool
+) -> list[cl.Context]:
+    """Return a context on each of `devices`. A name that is given several times stands for equally good ones in turn.
+
+    Raises
+    ------
+    DeviceError, InputError, InputTypeError
+        If one of them does not work, or does not compute in `real`; if two are the same, unless they `may_share` it.
+    """
+    if isinstance(devices, str) or not isinstance(devices, Sequence) or not devices:
+        raise InputTypeError(
+            f"devices is {devices!r:.60}, expected a list of names, indices, devices or contexts, such as "
+            "['0:0', '0:1']; `clvoro devices` lists them"
+        )
+    found = []
+    for number, given in enumerate(devices):
+        place = list(devices[:number]).count(given)
+        if isinstance(given, cl.Context):
+            found.append(context_of(given, real, place))
+        else:
+            found.append(context_for(given, real == np.float64, place))
+    places = [pci_address(ctx.devices[0]) or ctx.devices[0] for ctx in found]
+    for number, place in enumerate(places):
+        if (first := places.index(place)) < number and not may_share:
+            raise InputError(
+                f"devices {first} and {number} are the same, {found[number].devices[0].name.strip()}, expected "
+                "different ones; leave one of them out, or let parts of the mesh share it: share_gpus=True"
+            )
+    return found
+
+
 def context_for(device: str | cl.Device | None, fp64: bool, place: int) -> cl.Context:
     """Return a context as `create_context` does, for the rank at this `place` among those of its node."""
     _probe.check_process()

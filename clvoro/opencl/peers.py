@@ -39,11 +39,13 @@ class Peers:
     shared : bool
         Whether the run is one over ranks, be it a single one. The faces of a cell are then in the order of the
         permanent numbers of its neighbors.
+    gathers : bool
+        Whether this part gathers the mesh of all parts at the end of each run.
     exchanges, reductions : int
         Calls of `exchange` and of `gather` so far.
     """
 
-    number, count, shared = 0, 1, False
+    number, count, shared, gathers = 0, 1, False, False
     exchanges = reductions = 0
 
     def exchange(self, sent: Sequence[np.ndarray], sizes: ArrayLike | None = None) -> list[np.ndarray]:

@@ -4,8 +4,10 @@ import importlib.util
 import json
 import os
 import re
+import signal
 import subprocess
 import sys
+import threading
 import types
 from contextlib import nullcontext
 from pathlib import Path
@@ -26,51 +28,48 @@ from clvoro.errors import (
     MissingLibraryError,
     OutputError,
     RankError,
+    SizeErrorWarning,
 )
 from clvoro.io import arrays
 from clvoro.opencl.engine import Engine
 from clvoro.opencl.peers import Peers
+from clvoro.opencl.threads import Team
 from clvoro.tessellation.part_steps import PartSteps
-from tests.reference.peers import run_parts
 
 ARRAYS = ("points", "volumes", "centroids", "neighbor_starts", "neighbors", "face_measures", "face_centroids")
 SCRIPT = """
-import clvoro, sys
+import os, resource, sys
+import clvoro
+from clvoro.cli import main
 from clvoro.opencl import prebuild
 from mpi4py import MPI
 
 prebuild._start = lambda device: None  # no workers beside the ranks
-adapter = clvoro.Adapter(comm=MPI.COMM_WORLD)
-out = open(f"{sys.argv[1]}/{MPI.COMM_WORLD.rank}", "w")
-mesh = adapter.run(clvoro.Box((0, 0, 0), (1, 1, 1)), lambda p: 0.2 * (1 + p[:, 0]), effort="fast")
+folder, rank, pieces = sys.argv[1], MPI.COMM_WORLD.rank, ["--pieces", "--json"]
+out = open(f"{folder}/{rank}", "w")
+adapter, box = clvoro.Adapter(comm=MPI.COMM_WORLD), clvoro.Box((0, 0), (1, 1))
+mesh = adapter.run(box, lambda p: 0.1 * (1 + p[:, 0]), effort="fast")
 whole = mesh.gather()
-assert (whole is None) == (MPI.COMM_WORLD.rank > 0)
+assert (whole is None) == (rank > 0)
 if whole is not None:
     assert whole.check(), whole.check()
     print(len(whole), len(mesh), whole.history["cells"][-1], file=out)
 
 def fail(row):
-    if MPI.COMM_WORLD.rank == 1 and row["step"] == 2:
+    if rank == 1 and row["step"] == 2:
         raise OSError("no space left")
 
 try:
-    adapter.run(clvoro.Box((0, 0), (1, 1)), 0.1, "fast", callback=fail)
+    adapter.run(box, 0.1, "fast", callback=fail)
 except Exception as error:
     print(type(error).__name__, error, file=out)
-"""
-COMMANDS = """
-import os, resource, sys
-from clvoro.cli import main
-from clvoro.opencl import prebuild
 
-prebuild._start = lambda device: None
-folder, pieces = sys.argv[1], ["--pieces", "--json"]
 for name, options in {"whole": ["--no-report"], "pieces": pieces, "missing": [], "full": pieces}.items():
-    if name == "full" and os.environ["PMI_RANK"] == "1":
+    if name == "full" and rank == 1:
+        out.flush()
         resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000))
     case = f"{folder}/{'missing' if name == 'missing' else 'box'}.toml"
-    code = main(["run", case, "--out", f"{folder}/{name}", *options])
-    print(name, code, file=open(f"{folder}/{os.environ['PMI_RANK']}", "a"))
+    print(name, main(["run", case, "--out", f"{folder}/{name}", *options]), end=" ", file=out)
 """
 CASE = """
 [domain]
@@ -95,7 +94,7 @@ def run_in(parts, ctx, *given, dtype="float64", path=None, **options):
             mesh.save(path.with_name("case") / "case.foam")
         return mesh, mesh.gather()
 
-    found = run_parts(parts, work)
+    found = Team(parts).run(work)
     assert all(whole is None for _, whole in found[1:])
     return [mesh for mesh, _ in found], found[0][1]
 
@@ -152,8 +151,10 @@ def test_a_run_in_parts(ctx, dim, tmp_path):
     meshes, whole = run_in(3, ctx, *given, effort="fast", path=tmp_path / "mesh.pvtu")
     assert whole.check()
     if dim == 3:
-        again = run_in(3, ctx, *given, effort="fast")[1]
-        assert np.array_equal(again.points, whole.points)
+        again = clvoro.Adapter(devices=[ctx] * 3, share_gpus=True).run(*given, effort="fast")
+        assert again.parts is None
+        for name in ARRAYS:
+            assert np.array_equal(getattr(again, name), getattr(whole, name)), name
     sizes = [len(mesh) for mesh in meshes]
     assert sum(sizes) == len(whole)
     assert max(sizes) < 1.15 * len(whole) / 3
@@ -200,7 +201,14 @@ def test_parts_hold_what_one_device_does_not(ctx, monkeypatch):
         with pytest.raises(MemoryLimitError) if peers.number == 0 else nullcontext():
             mesh.gather()
 
-    run_parts(4, work)
+    # The whole mesh of several devices must be held by the first one, or by a CPU.
+    with pytest.raises(MemoryLimitError):
+        clvoro.Adapter(devices=[ctx] * 4, share_gpus=True).run(*given, method="lloyd", max_steps=0)
+    engine, limits = clvoro.Adapter(ctx)._engine_for(given[0]), [1.0, 1e9]
+    with monkeypatch.context() as patch:
+        patch.setattr(estimates, "available_memory", lambda _: limits.pop(0))
+        assert estimates.holder_of_all(engine, 1111, given[0]).queue != engine.queue
+    Team(4).run(work)
 
 
 def test_checkpoints_are_resumed_on_any_number_of_parts(ctx, tmp_path, monkeypatch):
@@ -244,9 +252,67 @@ def test_checkpoints_are_resumed_on_any_number_of_parts(ctx, tmp_path, monkeypat
         run_in(2, ctx, *given, **short, checkpoint=clvoro.Checkpoint(None, resume=state))
 
 
+def test_devices_share_a_run(ctx):
+    """One callback, warning, error and result of all devices. Ctrl-C gives the mesh so far."""
+    adapter = clvoro.Adapter(devices=[ctx, ctx], share_gpus=True)
+    box, here, steps = clvoro.Box((0, 0), (1, 1)), threading.get_ident(), []
+
+    def note(row):
+        assert threading.get_ident() == here
+        steps.append(int(row["step"]))
+        if len(steps) == 9:
+            raise KeyboardInterrupt
+        if len(steps) > 9:
+            raise OSError("no space left")
+
+    with pytest.raises(clvoro.Interrupted) as caught:
+        adapter.run(box, ramp(0.05), callback=note)
+    assert steps == list(range(9))
+    assert caught.value.result.stop_reason == "interrupted"
+    assert caught.value.result.check()
+    with pytest.raises(OSError, match="no space left"):
+        adapter.run(box, ramp(0.05), callback=note)
+    with pytest.warns(SizeErrorWarning) as warned:
+        mesh = adapter.run(box, 0.01, points=np.random.default_rng(70103).random((60, 2)), method="lloyd", max_steps=1)
+    assert len(warned) == 1
+    assert Path(warned[0].filename) == Path(__file__)
+    assert len(mesh) == 60
+    assert "and 1 more" in repr(adapter)
+    with pytest.raises(InputError, match="devices 0 and 1 are the same"):
+        clvoro.Adapter(devices=[ctx, ctx])
+    with pytest.raises(InputTypeError, match="expected a list of names"):
+        clvoro.Adapter(devices="gpu")
+    with pytest.raises(InputError, match="devices and ctx are given"):
+        clvoro.Adapter(ctx, devices=[ctx])
+
+
+def test_threads_end_together():
+    """An error is the only one that is raised, a thread that ends early lets no other wait, and so does Ctrl-C."""
+
+    def fail(peers):
+        if peers.number == 1:
+            raise ValueError("out of range")
+        peers.total(1)
+
+    def press(peers):
+        if peers.number == 0:
+            for _ in range(2):
+                peers.ask(lambda: signal.raise_signal(signal.SIGINT))
+        peers.total(1)
+
+    team = Team(3)
+    with pytest.raises(ValueError, match="out of range"):
+        team.run(fail)
+    with pytest.raises(RankError, match="part 0 of 3 has ended"):
+        team.run(lambda peers: peers.number and peers.total(1))
+    with pytest.raises(KeyboardInterrupt):
+        team.run(press)
+    assert team.run(lambda peers: int(peers.before(2))) == [0, 2, 4]
+
+
 @pytest.mark.parametrize("change", [{"method": "transport"}, {"fixed": [(0.5, 0.5)]}])
 def test_what_ranks_cannot_share_is_refused(ctx, change):
-    with pytest.raises(InputError, match="ranks share the run"):
+    with pytest.raises(InputError, match="devices share the run"):
         run_in(1, ctx, clvoro.Box((0, 0), (1, 1)), 0.2, **change)
     with pytest.raises(InputTypeError, match="communicator"):
         clvoro.Adapter(ctx, comm=4)
@@ -266,31 +332,30 @@ def test_parts_with_other_input_are_refused(ctx, name, shown):
         with pytest.raises(errors, match=f"rank 1 of 2 has {shown}"):
             adapter.run(clvoro.Box((0, 0), (1, 1)), **{"size": 0.2, name: changed[name]})
 
-    run_parts(2, work)
+    Team(2).run(work)
 
 
-needs_mpi = pytest.mark.skipif(importlib.util.find_spec("mpi4py") is None, reason="mpi4py is not installed")
+@pytest.mark.skipif(importlib.util.find_spec("mpi4py") is None, reason="mpi4py is not installed")
+def test_under_mpiexec(tmp_path):
+    """A script, then commands: rank 0 speaks and writes; in pieces each rank writes its cells.
 
-
-def run_script(text, folder):
-    """Run a script on two ranks, and return what it has printed."""
-    script = folder / "script.py"
-    script.write_text(text)
+    What fails on one rank is said once.
+    """
+    (tmp_path / "box.toml").write_text(CASE)
+    script = tmp_path / "script.py"
+    script.write_text(SCRIPT)
     mpiexec = Path(sys.executable).parent / "mpiexec"
     environment = {**os.environ, "POCL_MAX_PTHREAD_COUNT": "1", "PYTHONPATH": str(Path(clvoro.__file__).parents[1])}
-    command = [str(mpiexec if mpiexec.exists() else "mpiexec"), "-n", "2", sys.executable, str(script), str(folder)]
+    command = [str(mpiexec if mpiexec.exists() else "mpiexec"), "-n", "2", sys.executable, str(script), str(tmp_path)]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=240)
     assert done.returncode == 0, done.stderr[-3000:]
-    return done
 
-
-@needs_mpi
-def test_the_command_under_mpiexec(tmp_path):
-    """Rank 0 speaks and writes; in pieces each rank writes its cells. What fails on one rank is said once."""
-    (tmp_path / "box.toml").write_text(CASE)
-    done = run_script(COMMANDS, tmp_path)
-    for rank in "01":
-        assert (tmp_path / rank).read_text().split() == "whole 0 pieces 0 missing 2 full 1".split(), done.stderr
+    (line, *of_first), of_second = ((tmp_path / rank).read_text().splitlines() for rank in "01")
+    cells, own, recorded = map(int, line.split())
+    assert cells == recorded > own > cells / 3
+    codes = "whole 0 pieces 0 missing 2 full 1 "
+    assert of_first == ["RankError rank 1 of 2 has failed: OSError: no space left", codes]
+    assert of_second == ["OSError no space left", codes]
     assert done.stdout.count("written into") == 1
     shown = [line for line in done.stderr.splitlines() if line.startswith("clvoro: ")]
     assert len(shown) == 2, done.stderr
@@ -341,13 +406,3 @@ def test_what_the_command_refuses_over_ranks(tmp_path, monkeypatch):
         this_rank()
     monkeypatch.setenv("PMI_SIZE", "1")
     assert this_rank().count == 1
-
-
-@needs_mpi
-def test_a_script_under_mpiexec(tmp_path):
-    run_script(SCRIPT, tmp_path)
-    line, shown = (tmp_path / "0").read_text().splitlines()
-    assert shown == "RankError rank 1 of 2 has failed: OSError: no space left"
-    assert (tmp_path / "1").read_text() == "OSError no space left\n"
-    cells, own, recorded = map(int, line.split())
-    assert cells == recorded > own > cells / 3

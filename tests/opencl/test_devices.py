@@ -16,7 +16,7 @@ from clvoro.opencl import devices as device
 from clvoro.opencl import probe as _probe
 from clvoro.opencl import program
 from clvoro.opencl import runtimes as _runtimes
-from tests.reference.peers import run_parts
+from clvoro.opencl.threads import Team
 
 ROOT = Path(__file__).parents[2]
 
@@ -93,12 +93,12 @@ def test_ranks_of_a_node_take_its_gpus_in_turn(machine, monkeypatch):
     def create(peers):
         return device.create_context(comm=peers)
 
-    assert run_parts(4, lambda peers: choose(peers, 2, create)) == ["GPU 0", "GPU 1"] * 2
+    assert Team(4).run(lambda peers: choose(peers, 2, create)) == ["GPU 0", "GPU 1"] * 2
     with pytest.raises(InputError, match=r"ranks 0 and 2 of 3 have one GPU, 0000:3b:00.0 of node0.*share_gpus"):
-        run_parts(3, lambda peers: choose(peers, 3, create))
-    assert run_parts(2, lambda peers: choose(peers, 2, lambda _: [POCL])) == [POCL.name] * 2
+        Team(3).run(lambda peers: choose(peers, 3, create))
+    assert Team(2).run(lambda peers: choose(peers, 2, lambda _: [POCL])) == [POCL.name] * 2
     with pytest.raises((DeviceError, RankError)):
-        run_parts(2, lambda peers: device.create_context("none" if peers.number else None, comm=peers))
+        Team(2).run(lambda peers: device.create_context("none" if peers.number else None, comm=peers))
 
 
 ON_INTEL = FakeDevice(-6, "Portable Computing Language", "cpu-Intel(R) Xeon(R)", CPU, vendor="GenuineIntel")

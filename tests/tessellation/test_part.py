@@ -10,13 +10,13 @@ from clvoro.adaptation.insertion_deletion import CellSizes, Change, Generators
 from clvoro.adaptation.stages import Stages
 from clvoro.geometry.box import Box
 from clvoro.opencl.peers import ALONE
+from clvoro.opencl.threads import Team
 from clvoro.solvers import multigrid
 from clvoro.solvers.linear_system import Limits
 from clvoro.solvers.volume_projection import Penalty, Targets
 from clvoro.tessellation.part import Ghosts, Part
 from clvoro.tessellation.tessellator import Tessellator
 from tests.reference import patch
-from tests.reference.peers import run_parts
 
 N = {2: 500, 3: 900}
 SPACINGS = 5
@@ -74,7 +74,7 @@ class Halves:
             own = self.stages(peers)
             return work(own, self.part(own, peers), self.rows[peers.number])
 
-        return whole, run_parts(2, of_part)
+        return whole, Team(2).run(of_part)
 
     def joined(self, found):
         """Return arrays of both halves as one of the whole."""

@@ -1,0 +1,196 @@
+"""The parts of a domain in the threads of one process: each has a device of its own."""
+
+from __future__ import annotations
+
+import queue
+import threading
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
+
+import numpy as np
+
+from ..arguments import WARNING, warn
+from ..errors import RankError
+from .peers import Peers
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+Made = TypeVar("Made")
+_Calls: TypeAlias = "queue.SimpleQueue[Callable[[], object] | None]"
+
+
+class _Table:
+    """Where threads hand over what each of them gives, and wait for each other.
+
+    What they give in one round stays there in the next one, while other threads may still read it.
+    """
+
+    def __init__(self, count: int) -> None:
+        self._places, self._changed = ([None] * count, [None] * count), threading.Condition()
+        self._there = self._rounds = 0
+        self._closed = ""
+
+    def hand_over(self, number: int, given: Any) -> list[Any]:
+        """Return what all threads give, in their order; this is thread `number`.
+
+        Raises
+        ------
+        RankError
+            If the table has been closed.
+        """
+        with self._changed:
+            turn = self._rounds
+            places: list[Any] = self._places[turn % 2]
+            if not self._closed:
+                places[number] = given
+                self._there += 1
+                if self._there == len(places):
+                    self._there, self._rounds = 0, turn + 1
+                    self._changed.notify_all()
+                self._changed.wait_for(lambda: self._rounds > turn or self._closed)
+            if self._rounds == turn:
+                raise RankError(self._closed)
+        return list(places)
+
+    def close(self, why: str) -> None:
+        """Let threads that wait, and all that come later, raise an error. The first reason counts."""
+        with self._changed:
+            self._closed = self._closed or why
+            self._changed.notify_all()
+
+
+class Threads(Peers):
+    """The parts of a domain in the threads of a `Team`, as one of them sees them."""
+
+    shared = True
+
+    def __init__(self, team: Team, number: int, count: int) -> None:
+        self.team, self.number, self.count = team, number, count
+
+    def begin(self, table: _Table, calls: _Calls) -> None:
+        """Begin to work with the others at `table`. The thread that waits for all of them takes the `calls`."""
+        self._table, self._calls = table, calls
+
+    def end(self) -> None:
+        """Let threads that still wait for this one raise an error."""
+        self._table.close(f"part {self.number} of {self.count} has ended, and others wait for it")
+
+    def gather(self, values: np.ndarray) -> list[np.ndarray]:
+        """Hand over a copy, so that this part may write to `values` again. The arrays are read-only."""
+        self.reductions += 1
+        own = np.array(values)
+        own.setflags(write=False)
+        return self._table.hand_over(self.number, own)
+
+    def exchange(self, sent: Sequence[np.ndarray], sizes: ArrayLike | None = None) -> list[np.ndarray]:
+        """Hand over copies of the arrays."""
+        self.exchanges += 1
+        given = self._table.hand_over(self.number, [np.array(values) for values in sent])
+        return [arrays[self.number] for arrays in given]
+
+    def swap(self, sent: np.ndarray, sent_sizes: np.ndarray, received: np.ndarray, sizes: np.ndarray) -> None:
+        """Hand over a copy of the array, of which each part takes its slice."""
+        self.exchanges += 1
+        ends, to = np.cumsum(sent_sizes).tolist(), 0
+        for rows, others in self._table.hand_over(self.number, (np.array(sent), ends)):
+            first, last = others[self.number - 1] if self.number else 0, others[self.number]
+            received[to : to + last - first] = rows[first:last]
+            to += last - first
+
+    def fail(self, error: BaseException) -> None:
+        """Let all calls of other threads, and further ones of this thread, raise an error."""
+        self._table.close(f"part {self.number} of {self.count} has failed: {type(error).__name__}: {error}")
+
+    def ask(self, call: Callable[[], object]) -> Any:
+        """Return the result of `call` in the thread that waits for the team, or raise its error; None after Ctrl-C."""
+        answers: queue.SimpleQueue[tuple[object, BaseException | None]] = queue.SimpleQueue()
+
+        def answer() -> None:
+            try:
+                answers.put((call(), None))
+            except KeyboardInterrupt:
+                self.team.interrupt()
+                answers.put((None, None))
+            except BaseException as error:
+                answers.put((None, error))
+
+        self._calls.put(answer)
+        made, error = answers.get()
+        if error is not None:
+            raise error
+        return made
+
+
+class Team:
+    """Threads, one for each part, that do their work together.
+
+    Parameters
+    ----------
+    count : int
+        Number of threads.
+
+    Attributes
+    ----------
+    peers : tuple of Threads
+        What each of them sees.
+    interrupted : bool
+        Whether the user has pressed Ctrl-C since they began to work.
+    """
+
+    def __init__(self, count: int) -> None:
+        self.peers = tuple(Threads(self, number, count) for number in range(count))
+        self.interrupted = False
+        self._errors: list[BaseException] = []
+
+    def interrupt(self) -> None:
+        """Note that the user has pressed Ctrl-C; if it is for the second time, end the work."""
+        if self.interrupted:
+            self._errors.insert(0, KeyboardInterrupt())
+            self.peers[0].fail(self._errors[0])
+        self.interrupted = True
+
+    def run(self, work: Callable[[Threads], Made]) -> list[Made]:
+        """Call `work` in all threads, and return the results in their order.
+
+        Warnings of the first part are given in the thread that calls this; those of the others, which are the same, are
+        not given. After Ctrl-C `interrupted` is True, and `work` should end soon; a second Ctrl-C ends it.
+
+        Raises
+        ------
+        BaseException
+            The first error of a thread, after all of them have ended. `RankError` of threads that only wait for it does
+            not count.
+        """
+        calls: _Calls = queue.SimpleQueue()
+        table, results = _Table(len(self.peers)), [None] * len(self.peers)
+
+        def run(peers: Threads) -> None:
+            WARNING.set((lambda *given: peers.ask(lambda: warn(*given))) if peers.number == 0 else lambda *_: None)
+            try:
+                results[peers.number] = work(peers)  # type: ignore[call-overload]
+                peers.end()
+            except BaseException as error:
+                self._errors.append(error)
+                peers.fail(error)
+            calls.put(None)
+
+        self.interrupted, self._errors = False, []
+        for peers in self.peers:
+            peers.begin(table, calls)
+        threads = [threading.Thread(target=run, args=(peers,), daemon=True) for peers in self.peers]
+        for thread in threads:
+            thread.start()
+        at_work = len(threads)
+        while at_work:
+            try:
+                call = calls.get()
+                if call is None:
+                    at_work -= 1
+                else:
+                    call()
+            except KeyboardInterrupt:
+                self.interrupt()
+        if self._errors:
+            raise next((error for error in self._errors if not isinstance(error, RankError)), self._errors[0])
+        return results  # type: ignore[return-value]
