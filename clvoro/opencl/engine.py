@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, NamedTuple
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, NamedTuple, cast
 
 import numpy as np
 import pyopencl as cl
@@ -77,6 +77,24 @@ def group_sizes(device: cl.Device) -> GroupSizes:
     return GroupSizes(min(512, 8 * device.max_compute_units), 128)
 
 
+class PartialSums(NamedTuple):
+    """Sums over the cells of a part, which the other parts have, too.
+
+    Attributes
+    ----------
+    partial : (q * groups,) real, device
+        A row of `groups` sums for each of q quantities.
+    rows : tuple of k int
+        The rows to be summed over all parts.
+    largest : int, optional
+        A row of `rows` of which all parts need the maximum in place of the sum.
+    """
+
+    partial: cla.Array
+    rows: tuple[int, ...]
+    largest: int | None = None
+
+
 class Engine:
     """A device with a queue, a dimension and a precision.
 
@@ -130,6 +148,7 @@ class Engine:
         self.pool = KernelPool() if pool is None else pool
         self.peers = peers
         self._shared_kernels: dict[object, Kernels] = {}
+        self._copies: list[cl.Event] = []
 
     def replaced(self, *, real: np.dtype | None = None, traits: Traits | None = None) -> Engine:
         """Return an engine of another precision or other traits that shares workspace and kernels with this one."""
@@ -148,19 +167,29 @@ class Engine:
         """Return an engine for the whole domain that shares kernels with this one."""
         return Engine(self.ctx, self.queue, self.dim, self.real, self.traits, pool=self.pool)
 
-    def sum_over_parts(self, partial: cla.Array, *rows: int, largest: int | None = None) -> None:
-        """Replace these rows of partial sums by their sums over all parts, and row `largest` by the maximum.
+    def sum_over_parts(self, sums: PartialSums, swap: Callable[..., list[np.ndarray]] | None = None) -> np.ndarray:
+        """Replace partial sums by their sums over all parts; return their totals, (k,), in the order of rows.
 
-        `partial` (k * groups,) has a row of `groups` sums for each of k quantities.
+        The parts send each other the rows by `Peers.gather`, or by `swap`, which may do more at the same time.
         """
         if self.peers.count == 1:
-            return
-        sums, chosen = partial.get().reshape(-1, self.groups), list(rows)
-        found = np.stack(self.peers.gather(sums[chosen]))
-        sums[chosen] = found.sum(axis=0)
+            return np.empty(0)
+        partial, chosen, largest = sums
+        host = partial.get().reshape(-1, self.groups)
+        own = host[list(chosen)]
+        found = np.stack((swap or self.peers.gather)(own))
+        host[list(chosen)] = found.sum(axis=0)
         if largest is not None:
-            sums[largest] = found[:, chosen.index(largest)].max(axis=0)
-        partial.set(sums.ravel())
+            host[largest] = found[:, chosen.index(largest)].max(axis=0)
+        self.send(host, partial)
+        return host[list(chosen)].sum(axis=1)
+
+    def send(self, host: np.ndarray, array: cla.Array, offset: int = 0) -> None:
+        """Enqueue a copy of `host` to `array`, from byte `offset` on. `host` must not change any more."""
+        # The event of a copy keeps `host`. When it is deleted, it waits for the copy.
+        buffer = cast("cl.Buffer", array.base_data)
+        copy = cl.enqueue_copy(self.queue, buffer, host, dst_offset=array.offset + offset, is_blocking=False)
+        self._copies = [*self._copies[-1:], copy]
 
     @property
     def site_size(self) -> int:

@@ -17,10 +17,13 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
 Made = TypeVar("Made")
-PATIENCE, NAPS = 30, (1e-4, 2e-3)
+PATIENCE, NAPS = 10, (1e-4, 2e-3)
 """A rank that waits for a message first asks for it `PATIENCE` times without a pause. Then it sleeps before each
-question, since there may be more ranks than cores: for a quarter of the time waited so far, within the limits `NAPS` in
-seconds."""
+question, since there may be more ranks than cores: for as long as it has waited so far, within the limits `NAPS` in
+seconds. To fall asleep and to wake up takes some 30 microseconds of processor time."""
+FEW = 32
+"""Up to so many ranks send an array to each other directly. MPI's own algorithm has several rounds, and a rank that
+sleeps delays each of them."""
 ALARM, CLOSE, CLOSED = 1, 2, 3
 """Tags of messages: a rank has failed, rank 0 sends the exit code, another rank has received it."""
 GRACE = 1.0
@@ -56,13 +59,22 @@ class Peers:
         """
         return list(sent)
 
-    def swap(self, sent: np.ndarray, sent_sizes: np.ndarray, received: np.ndarray, sizes: np.ndarray) -> None:
+    def swap(
+        self,
+        sent: np.ndarray,
+        sent_sizes: np.ndarray,
+        received: np.ndarray,
+        sizes: np.ndarray,
+        values: np.ndarray | None = None,
+    ) -> list[np.ndarray]:
         """Send the rows of one array to all parts, and write the rows of all parts to `received`.
 
         Both arrays are in the order of parts: `sent_sizes` (p,) rows go to each part, `sizes` (p,) come from each.
+        If there are `values`, the method also returns what `gather` returns, and the parts wait only once for both.
         """
         found = self.exchange(np.split(sent, np.cumsum(sent_sizes)[:-1]), sizes)
         np.concatenate(found, out=received)
+        return [] if values is None else self.gather(values)
 
     def gather(self, values: np.ndarray) -> list[np.ndarray]:
         """Return the `values` of all parts, arrays of one shape, in their order."""
@@ -191,7 +203,14 @@ class Ranks(Peers):
         self._complete(*requests)
         return received
 
-    def swap(self, sent: np.ndarray, sent_sizes: np.ndarray, received: np.ndarray, sizes: np.ndarray) -> None:
+    def swap(
+        self,
+        sent: np.ndarray,
+        sent_sizes: np.ndarray,
+        received: np.ndarray,
+        sizes: np.ndarray,
+        values: np.ndarray | None = None,
+    ) -> list[np.ndarray]:
         """Send and receive slices of both arrays."""
         self.exchanges += 1
         requests, row = [], sent.dtype.itemsize * math.prod(sent.shape[1:])
@@ -203,15 +222,28 @@ class Ranks(Peers):
                 for part, (end, size) in enumerate(zip(ends.tolist(), counts.tolist(), strict=True))
                 if size
             ]
-        self._complete(*requests)
+        found, more = ([], []) if values is None else self._begin_gather(values)
+        self._complete(*requests, *more)
+        return list(found)
 
     def gather(self, values: np.ndarray) -> list[np.ndarray]:
         """Collect one array of each rank on all of them."""
+        found, requests = self._begin_gather(values)
+        self._complete(*requests)
+        return list(found)
+
+    def _begin_gather(self, values: np.ndarray) -> tuple[np.ndarray, list[Any]]:
+        """Return the array that gets the `values` of all ranks, and the requests to be completed."""
         self.reductions += 1
         values = np.asarray(values, order="C")
         found = np.empty((self.count, *values.shape), values.dtype)
-        self._complete(self._comm.Iallgather(_bytes(values), _bytes(found)))
-        return list(found)
+        own, rows = _bytes(values), _bytes(found).reshape(self.count, values.nbytes)
+        if self.count > FEW:
+            return found, [self._comm.Iallgather(own, rows)]
+        found[self.number] = values
+        others = [part for part in range(self.count) if part != self.number]
+        requests = [self._comm.Irecv(rows[part], part) for part in others]
+        return found, requests + [self._comm.Isend(own, part) for part in others]
 
     def _complete(self, *requests: Any) -> None:
         """Wait for `requests`, unless a rank fails."""
@@ -224,7 +256,7 @@ class Ranks(Peers):
                 if self._alarms.Iprobe(tag=ALARM):
                     self._failed = self._alarms.recv(tag=ALARM)
                     raise RankError(self._failed)
-                time.sleep(min(max(waited / 4, NAPS[0]), NAPS[1]))
+                time.sleep(min(max(waited, NAPS[0]), NAPS[1]))
                 waited = time.perf_counter() - began
 
     def fail(self, error: BaseException) -> None:

@@ -9,7 +9,7 @@ import pyopencl as cl
 import pyopencl.array as cla
 
 from ..errors import SolverError
-from ..opencl.engine import Engine
+from ..opencl.engine import Engine, PartialSums
 from ..opencl.kernels import Kernels
 from ..opencl.launch import Launch, one_group_limit
 from ..opencl.workspace import framed
@@ -22,6 +22,8 @@ RECORD_NORM, RECORD_RUNNING, RECORD_CURVATURE = 0, 2, 3
 _STATE = 8
 _FIRST_READ = 32
 """Iterations whose record is read together with the state that `solve_by_group` leaves."""
+NEARLY = 1 + 1e-6
+"""Squared residuals over their target from which on the host, which knows sums over all parts, asks the device."""
 
 
 class ConjugateGradient:
@@ -224,7 +226,9 @@ class ConjugateGradient:
         while done < most:
             end = min(done + ahead, most)
             for k in range(done, end):
-                system.iterate(k)
+                if system.iterate(k):
+                    end = k + 1
+                    break
             system.record_norm()
             *rows, (removed, norm_b, *_) = self.record[4 * done : 4 * (end + 2)].get().reshape(-1, 4)
             if unknown and self.relative_residual(removed, norm_b, rows[0][RECORD_NORM]) < 0:
@@ -287,16 +291,18 @@ class _Iteration:
         self._rhs, self._x = rhs, x
         self._kernels = k = solver.kernels_in(store)
         scratch = self._engine.scratch
-        self._r, self._u, self._q = (scratch(n, store) for _ in range(3))
-        part, all_n = operator.part, int(self._engine.peers.total(n))
-        self._p = scratch(n if part is None else part.count, store)
+        rows, all_n = n if operator.part is None else operator.part.count, int(self._engine.peers.total(n))
+        self._r, self._q = (scratch(n, store) for _ in range(2))
+        # Each part finds the directions of its ghosts, too.
+        self._u, self._p = (scratch(rows, store) for _ in range(2))
+        self._tolerance, self._target = 0.95 * tolerance, 0.0
         # On CPUs it costs more to evaluate directions of neighbors again than to store them.
         self._merged = operator.rows is not None and self._engine.group_size > 1
         directions = (self._p, scratch(n, store)) if self._merged else (self._p, self._p)
         self._sums = (_NORM_R, _SUM_R, _GAMMA) if isinstance(precondition, cla.Array) else (_NORM_R, _SUM_R)
         self._size, self._center = np.int32(n), np.int32(all_n if operator.singular else 0)
         # The recurrence stops slightly below the tolerance, so that the true residual is within it.
-        limit = self._engine.real.type(0.95 * tolerance)
+        limit = self._engine.real.type(self._tolerance)
         self._tail = (solver.partial, solver.state, solver.record)
         first = solver.counts
         self._find_direction, self._update_solution = [], []
@@ -305,7 +311,7 @@ class _Iteration:
                 assert operator.rows is not None
                 direction = (k.apply_to_direction, first, self._size, limit, *operator.rows, self._u, old, p, self._q)
             else:
-                direction = k.update_direction, first, self._size, limit, self._u, p
+                direction = k.update_direction, first, np.int32(rows), limit, self._u, p
             self._find_direction.append(Launch(self._engine, *direction, *self._tail))
             vectors = p, self._q, x, self._r
             if isinstance(precondition, cla.Array):
@@ -331,7 +337,7 @@ class _Iteration:
         k, anew = self._kernels, np.int32(from_zero)
         partial, state, _ = self._tail
         self._launch(k.sum_right_sides, self._size, anew, self._rhs, self._q, partial)
-        self._engine.sum_over_parts(partial, _SUM_B, _START, _MAX_B, largest=_MAX_B)
+        self._engine.sum_over_parts(PartialSums(partial, (_SUM_B, _START, _MAX_B), largest=_MAX_B))
         self._launch(
             k.start_residual,
             self._size,
@@ -346,7 +352,11 @@ class _Iteration:
             state,
             self._solver.counts,
         )
-        self._engine.sum_over_parts(partial, _NORM_B, _NORM_R, _SUM_R)
+        totals = self._engine.sum_over_parts(PartialSums(partial, (_NORM_B, _NORM_R, _SUM_R)))
+        if len(totals):
+            self._target = (self._tolerance**2) * totals[0]
+        if len(self._p) > len(self._rhs):
+            self._p.fill(0)
 
     def begin(self) -> None:
         """Precondition the first residual."""
@@ -354,25 +364,34 @@ class _Iteration:
             self._launch(
                 self._kernels.precondition_jacobi, self._size, self._precondition, self._r, self._u, self._tail[0]
             )
-            self._engine.sum_over_parts(self._tail[0], _GAMMA)
+            self._sum(_GAMMA, of=self._u)
 
-    def iterate(self, k: int) -> None:
-        """Enqueue iteration k."""
+    def iterate(self, k: int) -> bool:
+        """Enqueue iteration k. Return whether the residual is known to be within the tolerance.
+
+        It is known where there are other parts, and then not by the last digits.
+        """
         if not isinstance(self._precondition, cla.Array):
-            self._precondition(self._r, self._u, self._q)
+            self._precondition(self._r, self._u[: len(self._r)], self._q)
             self._dot_product(_GAMMA + (k & 1), self._r, self._u)
-            self._engine.sum_over_parts(self._tail[0], _GAMMA + (k & 1))
+            self._sum(_GAMMA + (k & 1), of=self._u)
         direction, solution = self._find_direction[k & 1], self._update_solution[k & 1]
         direction()
         if not self._merged:
-            if self._operator.part is not None:
-                self._operator.part.forward(self._engine, self._p)
             self._operator.apply(self._p, self._q)
             if not self._operator.writes_curvature:
                 self._dot_product(CURVATURE, self._p, self._q)
-            self._engine.sum_over_parts(self._tail[0], CURVATURE)
+            self._sum(CURVATURE)
         solution()
-        self._engine.sum_over_parts(self._tail[0], *(row + (k + 1) % 2 for row in self._sums))
+        totals = self._sum(*(row + (k + 1) % 2 for row in self._sums), of=self._u if len(self._sums) > 2 else None)
+        return len(totals) > 0 and totals[0] <= self._target * NEARLY
+
+    def _sum(self, *rows: int, of: cla.Array | None = None) -> np.ndarray:
+        """Sum these rows over all parts, and get the values of ghosts in `of`, if given; return the totals."""
+        sums, part = PartialSums(self._tail[0], rows), self._operator.part
+        if part is None or of is None:
+            return self._engine.sum_over_parts(sums)
+        return part.forward(self._engine, of, sums=sums)
 
     def record_norm(self) -> None:
         """Record the residual before the next iteration, and whether it is needed."""
@@ -381,7 +400,7 @@ class _Iteration:
 
     def center(self) -> None:
         """Subtract its mean from x."""
-        self._engine.sum_over_parts(self._tail[0], _SUM_X)
+        self._sum(_SUM_X)
         self._launch(self._kernels.center_solution, self._size, self._center, self._x, self._tail[0])
 
     def _dot_product(self, row: int, a: cla.Array, b: cla.Array) -> None:

@@ -15,7 +15,7 @@ import numpy as np
 import pyopencl.array as cla
 
 from ..errors import InputError
-from ..opencl.engine import Engine
+from ..opencl.engine import Engine, PartialSums
 from ..opencl.kernels import Kernels
 from ..opencl.launch import COSTS_ON_CPU, CostFactors, Launch, cost_factors, one_group_limit
 from .components import connected_components
@@ -225,7 +225,7 @@ class Poisson:
         # These kernels are the same for both precisions of the weights, which are mostly single.
         partial, kernels = self._conjugate_gradient.partial, self._kernels_in(np.dtype(np.float32))
         self.engine.run_blocks(kernels.sum_sources, size, source, volumes, partial)
-        self.engine.sum_over_parts(partial, 0, 1)
+        self.engine.sum_over_parts(PartialSums(partial, (0, 1)))
         self.engine.run_blocks(kernels.subtract_mean_source, size, source, volumes, rhs, partial)
         return rhs
 

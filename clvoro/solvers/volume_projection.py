@@ -15,12 +15,12 @@ import pyopencl.array as cla
 
 from ..errors import SolverError
 from ..opencl.device_array import read_numbers
-from ..opencl.engine import Engine
+from ..opencl.engine import Engine, PartialSums
 from ..opencl.kernels import Kernels
 from ..opencl.launch import Launch, one_group_limit
 from ..opencl.workspace import framed
 from ..tessellation.device_diagram import Tessellation
-from .conjugate_gradient import RECORD_CURVATURE, RECORD_NORM, RECORD_RUNNING
+from .conjugate_gradient import NEARLY, RECORD_CURVATURE, RECORD_NORM, RECORD_RUNNING
 from .linear_system import Limits, Solution, SolutionToRead
 
 SINGLE_PRECISION_TOLERANCE = 1e-4
@@ -194,10 +194,9 @@ class VolumeProjection:
             self._unread = ref(solution)
             return solution
         Launch(engine, k.assemble_projection, *given, self._counts, *rest)()
-        engine.sum_over_parts(self._partial, _NORM, _GAMMA)
         direction = Launch(engine, k.update_projection_direction, *given, self._counts)
         update = Launch(engine, k.update_projection, *given, self._counts)
-        rows = self._iterate(t, v, direction, update, most)
+        rows = self._iterate(t, v, direction, update, limits)
         solution = self._solution(rows, limits.tolerance)
         if solution.iterations:
             engine.run_each(k.write_correction, n, v.u, v.y, targets.h, t.points, correction, start)
@@ -216,9 +215,8 @@ class VolumeProjection:
     ) -> tuple[object, ...]:
         """Return ASSEMBLY_ARGS of volume_projection.cl but for the start."""
         real, sums = self.engine.real.type, targets.sums
-        if sums is not None and self.engine.peers.count > 1:
-            sums = self.engine.upload(self.engine.peers.total(sums.get()))
-        of_all = t.with_ghosts(self.engine, t.volumes, targets.h, targets.quality, displacement)
+        summed = None if sums is None else PartialSums(sums, (0, 1))
+        of_all = t.with_ghosts(self.engine, t.volumes, targets.h, targets.quality, displacement, sums=summed)
         volumes, h, quality, displacement = of_all
         return (
             t.face_measures,
@@ -240,22 +238,28 @@ class VolumeProjection:
             *t.fixed_args(self.engine, labels, fixed),
         )
 
-    def _iterate(self, t: Tessellation, v: _Arrays, direction: Launch, update: Launch, most: int) -> list[list[float]]:
-        """Iterate until the tolerance is met, or `most` times; return the record up to there or further."""
-        engine = self.engine
-        t.forward(engine, v.z)
+    def _iterate(
+        self, t: Tessellation, v: _Arrays, direction: Launch, update: Launch, limits: Limits
+    ) -> list[list[float]]:
+        """Iterate until the tolerance is met, or `max_iterations` times; return the record up to there or further."""
+
+        def send(values: cla.Array, *rows: int) -> np.ndarray:
+            return t.forward(self.engine, values, sums=PartialSums(self._partial, rows))
+
+        # The host knows the norms where there are other parts.
+        target = NEARLY * limits.tolerance**2 * sum(send(v.z, _NORM, _GAMMA)[:1])
         direction()
-        engine.sum_over_parts(self._partial, _CURVATURE)
-        done, ahead = 0, self._ahead
+        done, ahead, most = 0, self._ahead, limits.max_iterations
         while True:
             end = min(done + ahead, most)
             for turn in range(done, end):
-                t.forward(engine, v.s)
+                send(v.s, _CURVATURE)
                 update()
-                engine.sum_over_parts(self._partial, _NORM + (turn + 1) % 2, _GAMMA + (turn + 1) % 2)
-                t.forward(engine, v.z)
+                norm = send(v.z, _NORM + (turn + 1) % 2, _GAMMA + (turn + 1) % 2)[:1]
                 direction()
-                engine.sum_over_parts(self._partial, _CURVATURE)
+                if (norm <= target).any():
+                    end = turn + 1
+                    break
             rows = self._read(end)
             if not all(row[RECORD_RUNNING] for row in rows):
                 self._ahead = _first_stop(rows) + _SPARE

@@ -15,7 +15,7 @@ from ..geometry.sphere import directions, farthest_place
 
 if TYPE_CHECKING:
     from ..geometry.domain import Domain
-    from ..opencl.engine import Engine
+    from ..opencl.engine import Engine, PartialSums
     from .clipped.trim import Trimmed
     from .part import Part
     from .periodic.ghost_images import Folded
@@ -195,14 +195,13 @@ class Tessellation:
             reach=None if self.reach is None else self.reach[:n],
         )
 
-    def forward(self, engine: Engine, *values: cla.Array) -> None:
-        """Fill the rows of ghosts in each of `values` (rows, ...), if there are any."""
-        if self.part is not None:
-            self.part.forward(engine, *values)
+    def forward(self, engine: Engine, *values: cla.Array, sums: PartialSums | None = None) -> np.ndarray:
+        """Fill the rows of ghosts in each of `values` (rows, ...), if there are any; see `Part.forward`."""
+        return np.empty(0) if self.part is None else self.part.forward(engine, *values, sums=sums)
 
-    def with_ghosts(self, engine: Engine, *values: cla.Array) -> list[cla.Array]:
+    def with_ghosts(self, engine: Engine, *values: cla.Array, sums: PartialSums | None = None) -> list[cla.Array]:
         """Return each of `values` (n, ...) followed by those of ghosts, in the workspace; without ghosts, `values`."""
-        return list(values) if self.part is None else self.part.with_ghosts(engine, *values)
+        return list(values) if self.part is None else self.part.with_ghosts(engine, *values, sums=sums)
 
     def names(self, engine: Engine, labels: cla.Array) -> cla.Array:
         """Return `labels` (n,) int32 of the generators, followed by those of ghosts."""

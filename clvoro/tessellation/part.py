@@ -15,6 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -23,7 +24,7 @@ import pyopencl.array as cla
 
 from ..geometry.domain import ClipBox
 from ..opencl.device_array import buffer_of
-from ..opencl.engine import Engine
+from ..opencl.engine import Engine, PartialSums
 from ..opencl.peers import Peers
 
 if TYPE_CHECKING:
@@ -78,7 +79,7 @@ class Ghosts:
         needed = engine.upload(np.concatenate(sent), np.int32)
         return cls(engine.upload(rows, np.int32), None, None, peers, parts, needed, sizes, counts)
 
-    def fill(self, engine: Engine, n_own: int, *values: cla.Array) -> None:
+    def fill(self, engine: Engine, n_own: int, *values: cla.Array, sums: PartialSums | None = None) -> np.ndarray:
         """Fill the rows of each of `values` from `n_own` on with the values of the owners; see `Part.forward`."""
         kernels = engine.kernels("tessellation/part", shared=True)
         words = [math.prod(array.shape[1:]) * array.dtype.itemsize // 4 for array in values]
@@ -86,28 +87,32 @@ class Ghosts:
             for array, width in zip(values, words, strict=True):
                 size = array.shape[0] - n_own
                 engine.run_each(kernels.forward_values, size, np.int32(n_own), self.rows, np.int32(width), array)
-            return
+            return np.empty(0)
         assert self.sent is not None
         row, s, g = sum(words), len(self.sent), len(self.parts)
         columns = [(np.int32(width), np.int32(row), np.int32(sum(words[:k]))) for k, width in enumerate(words)]
         with engine.workspace.frame():
-            packed, given = np.empty((s, row), np.uint32), engine.scratch(s * row, np.uint32)
+            packed, given, copy = np.empty((s, row), np.uint32), engine.scratch(s * row, np.uint32), None
             if s:
                 for array, which in zip(values, columns, strict=True):
                     engine.run_each(kernels.pack_rows, s, self.sent, array, *which, given)
-                cl.enqueue_copy(engine.queue, packed, buffer_of(given))
-            received = np.empty((g, row), np.uint32)
-            self.peers.swap(packed, np.asarray(self.sent_counts), received, np.asarray(self.counts))
-            if not g:
-                return
-            if len(values) == 1:
-                start = n_own * 4 * row
-                cl.enqueue_copy(engine.queue, buffer_of(values[0]), received, dst_offset=start)
-                return
-            taken = engine.scratch(g * row, np.uint32)
-            taken.set(received.ravel())
-            for array, which in zip(values, columns, strict=True):
-                engine.run_each(kernels.unpack_rows, g, np.int32(n_own), taken, *which, array)
+                # If sums are read next, this copy is complete then.
+                copy = cl.enqueue_copy(engine.queue, packed, buffer_of(given), is_blocking=sums is None)
+            received, totals = np.empty((g, row), np.uint32), np.empty(0)
+            rows = packed, np.asarray(self.sent_counts), received, np.asarray(self.counts)
+            if sums is None:
+                self.peers.swap(*rows)
+            else:
+                totals = engine.sum_over_parts(sums, partial(self.peers.swap, *rows))
+            del copy
+            if g and len(values) == 1:
+                engine.send(received, values[0], n_own * 4 * row)
+            elif g:
+                taken = engine.scratch(g * row, np.uint32)
+                engine.send(received, taken)
+                for array, which in zip(values, columns, strict=True):
+                    engine.run_each(kernels.unpack_rows, g, np.int32(n_own), taken, *which, array)
+        return totals
 
 
 @dataclass(frozen=True)
@@ -227,21 +232,21 @@ class Part:
         engine.run_each(kernel, SUMS, np.int32(self.n_own), *given, *limited, sums)
         return sums.get().sum(axis=0, dtype=float)
 
-    def forward(self, engine: Engine, *values: cla.Array) -> None:
+    def forward(self, engine: Engine, *values: cla.Array, sums: PartialSums | None = None) -> np.ndarray:
         """Fill the rows of ghosts in each of `values` (count, ...) with the values of their owners.
 
         Values are whole 32-bit words of any type. Rows of ghosts without owner stay as they are. Other parts get all
-        `values` in one message.
+        `values` in one message. With `sums` the method does the work of `Engine.sum_over_parts`, too, while the parts
+        wait only once.
         """
-        if self.ghosts is not None:
-            self.ghosts.fill(engine, self.n_own, *values)
+        return np.empty(0) if self.ghosts is None else self.ghosts.fill(engine, self.n_own, *values, sums=sums)
 
-    def with_ghosts(self, engine: Engine, *values: cla.Array) -> list[cla.Array]:
-        """Return each of `values` (n_own, ...) with those of ghosts behind them, in the workspace."""
+    def with_ghosts(self, engine: Engine, *values: cla.Array, sums: PartialSums | None = None) -> list[cla.Array]:
+        """Return each of `values` (n_own, ...) with those of ghosts behind them, in the workspace; see `forward`."""
         if self.ghosts is None:
             return list(values)
         all_of = [engine.scratch((self.count, *array.shape[1:]), array.dtype) for array in values]
         for extended, array in zip(all_of, values, strict=True):
             cl.enqueue_copy(engine.queue, buffer_of(extended), buffer_of(array), byte_count=array.nbytes)
-        self.forward(engine, *all_of)
+        self.forward(engine, *all_of, sums=sums)
         return all_of
