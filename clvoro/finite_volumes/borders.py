@@ -54,7 +54,7 @@ def on_surfaces(diagram: Diagram, sheets: Sheets) -> Diagram:
         narrow = _faces_to_collapse(made, h)
         if not narrow.any():
             break
-        made = _moved(collapse_short(made.faces, made, narrow, narrow), sheets, h)
+        made = _moved(collapse_short(made.faces, None, narrow, narrow), sheets, h)
     # Then single faces are collapsed where fewer cells are rejected afterwards.
     rejected, tried = _rejected(made), 0
     while len(rejected) and tried < _TRIALS:

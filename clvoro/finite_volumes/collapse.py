@@ -9,14 +9,12 @@ from ..mesh.connectivity import distinct, following, slices, take_ranges, take_r
 from ..mesh.diagram import Diagram
 from ..mesh.faces import Faces
 from ..mesh.geometry import cross_columns, dots, lengths, smaller_size, sum_columns
-from .defects import DefectLimits
+from .defects import SMALL_FACE, DefectLimits
 from .merging import Merges, MergingCells
 from .seams import pack
 
 SHORT_EDGE = 0.02
 """Edges shorter than this share of h, the cube root of a cell's volume, are collapsed."""
-SMALL_FACE = 1e-3
-"""Faces smaller than this share of h^2 are collapsed."""
 SKEWED = 1.8
 """Faces of a greater skewness are collapsed, if they are small."""
 _SKEWED_FACE = 2e-2
@@ -35,7 +33,7 @@ _SURE = 1.05
 
 def collapse_short(
     mesh: Faces,
-    diagram: Diagram,
+    diagram: Diagram | None,
     unwanted: np.ndarray | None = None,
     chosen: np.ndarray | None = None,
     suspects: np.ndarray | None = None,
@@ -53,7 +51,8 @@ def collapse_short(
     ----------
     mesh : Faces
         Of the diagram, in 3D.
-    diagram : Diagram
+    diagram : Diagram or None
+        What measures come from; None if they follow from the corners.
     unwanted : (f,) bool, optional
         Faces that are collapsed whatever their size.
     chosen : (f,) bool, optional
@@ -61,8 +60,9 @@ def collapse_short(
     suspects : (f,) bool, optional
         What `find_suspects` returns; by default it is called.
     """
-    suspects = find_suspects(mesh, diagram) if suspects is None else suspects
-    if chosen is not None:
+    if suspects is None:
+        suspects = find_suspects(mesh, diagram, chosen)
+    elif chosen is not None:
         suspects = suspects & chosen
     if unwanted is not None:
         suspects = suspects | unwanted
@@ -93,17 +93,19 @@ def collapse_short(
     return mesh.compact() if unchanged else _unfold(mesh, cells, faces)
 
 
-def find_suspects(mesh: Faces, diagram: Diagram) -> np.ndarray:
+def find_suspects(mesh: Faces, diagram: Diagram | None, chosen: np.ndarray | None = None) -> np.ndarray:
     """Return which faces may be small or skew, or have a short side, (f,) bool. A few may have none of these.
 
-    All faces are read here, and never again. Their areas are those of the diagram.
+    All faces, or those that are `chosen` (f,) bool, are read here, and never again. Their areas are those of the
+    diagram, if there is one.
     """
-    h = smaller_size(mesh.owner, mesh.neighbor, np.cbrt(diagram.volumes))
-    found = diagram.face_measures[mesh.half_face] < _SURE * _SKEWED_FACE * h**2
+    rows = np.arange(len(mesh)) if chosen is None else np.flatnonzero(chosen)
+    volumes, areas = (mesh.volumes, mesh.area) if diagram is None else (diagram.volumes, diagram.face_measures)
+    h = smaller_size(mesh.owner[rows], mesh.neighbor[rows], np.cbrt(volumes))
+    small = areas[rows if diagram is None else mesh.half_face[rows]] < _SURE * _SKEWED_FACE * h**2
     limit, (x, *others) = (_SURE * SHORT_EDGE * h) ** 2, np.ascontiguousarray(mesh.points.T)
-    for part in slices(len(found), _CHUNK):
-        starts = mesh.starts[part.start : part.stop + 1]
-        begin, starts = mesh.corners[starts[0] : starts[-1]], starts - starts[0]
+    for part in slices(len(rows), _CHUNK):
+        starts, begin = take_rows(mesh.starts, mesh.corners, rows[part])
         head, last = starts[:-1], starts[1:] - 1
         end, step, here = np.empty_like(begin), np.empty(len(begin)), x.take(begin)
         end[:-1], end[last] = begin[1:], begin[head]
@@ -117,12 +119,14 @@ def find_suspects(mesh: Faces, diagram: Diagram) -> np.ndarray:
         for y in others:
             squares += (y.take(end) - y.take(begin)) ** 2
         near, squares = near[squares < most], squares[squares < most]
-        rows = np.searchsorted(starts, near, "right") - 1
-        found[part.start + rows[squares < limits[rows]]] = True
+        at = np.searchsorted(starts, near, "right") - 1
+        small[part.start + at[squares < limits[at]]] = True
+    found = np.zeros(len(mesh), bool)
+    found[rows[small]] = True
     return found
 
 
-def _fold(mesh: Faces, diagram: Diagram) -> tuple[MergingCells, np.ndarray]:
+def _fold(mesh: Faces, diagram: Diagram | None) -> tuple[MergingCells, np.ndarray]:
     """Return the cells of `mesh` with faces at seams and images of points once; the faces of `mesh` that they have."""
     upper = np.flatnonzero((mesh.twin < 0) | (mesh.twin > np.arange(len(mesh.twin))))
     points, extent = mesh.points, np.asarray(mesh.domain.extent, float)
@@ -136,16 +140,7 @@ def _fold(mesh: Faces, diagram: Diagram) -> tuple[MergingCells, np.ndarray]:
         starts, corners = mesh.starts, mesh.corners
         codes, face_codes = (np.broadcast_to(0, len(of)) for of in (corners, upper))
     cells = MergingCells(
-        points,
-        starts,
-        corners,
-        codes,
-        mesh.owner[upper],
-        mesh.neighbor[upper],
-        face_codes,
-        diagram,
-        mesh.half_face[upper],
-        SMALL_FACE,
+        mesh, diagram, points, starts, corners, codes, mesh.owner[upper], mesh.neighbor[upper], face_codes, upper
     )
     on = np.flatnonzero(cells.walls)
     here = cells.points[on]
@@ -178,7 +173,10 @@ def _unfold(mesh: Faces, cells: MergingCells, upper: np.ndarray) -> Faces:
         points = cells.positions(vertices[order][new], codes[order][new]).T
     else:
         starts, corners = take_ranges(cells.begin[left], cells.count[left], cells.corners)
-    return mesh.take_faces(left, points=points, starts=starts, corners=corners).compact()
+    made = mesh.take_faces(left, points=points, starts=starts, corners=corners).compact()
+    if not len(seam):
+        made.take_vectors(mesh, left, cells.edited[left])
+    return made
 
 
 class _Scan:

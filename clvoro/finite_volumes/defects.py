@@ -7,17 +7,21 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..mesh.connectivity import distinct, following, take_rows
+from ..mesh.connectivity import distinct, following, slices, take_rows
 from ..mesh.geometry import cross_columns, dots, lengths, loop_geometry, pyramid_sums, smaller_size
 
 if TYPE_CHECKING:
     from .merging import MergingCells
     from .neighborhood import Neighborhood
 
+SMALL_FACE = 1e-3
+"""Faces smaller than this share of h^2 are collapsed."""
 _WORSE = 0.02
 """Change of non-orthogonality, in degrees, and relative change of skewness that is accepted anywhere."""
 _THIN = 1e-6
 """Least volume of a tetrahedron over that of the pyramid of its face."""
+_PAIRS = 1 << 16
+"""Pairs of faces that are compared at a time: their arrays fit the caches."""
 
 
 @dataclass(frozen=True)
@@ -127,7 +131,7 @@ def find_defects(around: Neighborhood, limits: DefectLimits, targets: np.ndarray
 def _large(whole: MergingCells, faces: np.ndarray, areas: np.ndarray) -> np.ndarray:
     """Return which of `faces` are at least as large as the limit. `areas` (3, ...) are their area vectors."""
     h = smaller_size(whole.owner[faces], whole.neighbor[faces], whole.sizes)
-    return np.sqrt((areas**2).sum(axis=0)) >= whole.small * h**2
+    return np.sqrt((areas**2).sum(axis=0)) >= SMALL_FACE * h**2
 
 
 def _shapes(around: Neighborhood, x: np.ndarray) -> _Shapes:
@@ -231,21 +235,23 @@ def concave_pairs(
     counts = np.diff(starts)
     wide = -(counts // -4) * 4  # cells are compared together that have about as many faces
     for k in distinct(wide[wide > 0]).tolist():
-        rows = np.flatnonzero(wide == k)
-        within = np.arange(k) < counts[rows, None]
-        places = starts[rows, None] + np.where(within, np.arange(k), 0)
-        c, s = centers.take(places, axis=1), normals.take(places, axis=1)
-        c -= c.mean(axis=2, keepdims=True)
-        s[:, ~within] = np.nan
-        own = (s * c).sum(axis=0)
-        # Few pairs are this near to a plane: only these are computed.
-        reach = 2 * np.sqrt((c * c).sum(axis=0).max(axis=1))
-        own += min(limit, -1e-12) * reach[:, None]
-        c[:, ~within] = np.nan
-        products = np.matmul(s.transpose(1, 2, 0), c.transpose(1, 0, 2))
-        pairs = np.flatnonzero(products > own[:, :, None])
-        first = pairs // k
-        found.append(np.stack([places.ravel()[first], places[first // k, pairs % k]]))
+        of_size = np.flatnonzero(wide == k)
+        for part in slices(len(of_size), max(_PAIRS // (k * k), 1)):
+            rows = of_size[part]
+            within = np.arange(k) < counts[rows, None]
+            places = starts[rows, None] + np.where(within, np.arange(k), 0)
+            c, s = centers.take(places, axis=1), normals.take(places, axis=1)
+            c -= c.mean(axis=2, keepdims=True)
+            s[:, ~within] = np.nan
+            own = (s * c).sum(axis=0)
+            # Few pairs are this near to a plane: only these are computed.
+            reach = 2 * np.sqrt((c * c).sum(axis=0).max(axis=1))
+            own += min(limit, -1e-12) * reach[:, None]
+            c[:, ~within] = np.nan
+            products = np.matmul(s.transpose(1, 2, 0), c.transpose(1, 0, 2))
+            pairs = np.flatnonzero(products > own[:, :, None])
+            first = pairs // k
+            found.append(np.stack([places.ravel()[first], places[first // k, pairs % k]]))
     i, j = np.concatenate(found, axis=1)
     near = (i != j) & (changed[i] | changed[j])
     i, j = i[near], j[near]

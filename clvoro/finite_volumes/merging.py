@@ -13,6 +13,7 @@ import numpy as np
 
 from ..mesh.connectivity import distinct, independent, take_ranges, take_rows
 from ..mesh.diagram import Diagram
+from ..mesh.faces import Faces
 from ..mesh.geometry import lengths, loop_geometry, sum_columns
 from .defects import DefectLimits, Defects, find_defects
 from .neighborhood import Neighborhood
@@ -115,6 +116,14 @@ class MergingCells:
 
     In periodic directions images of a vertex are one vertex, and a corner of a face is a vertex with an offset.
 
+    Parameters
+    ----------
+    mesh : Faces
+    diagram : Diagram or None
+        See `collapse_short`.
+    rows : (f,) int
+        The faces of `mesh`; their corners, cells and offsets are the other parameters.
+
     Attributes
     ----------
     points : (v, 3) float
@@ -138,11 +147,13 @@ class MergingCells:
     centroids : (n, 3) float
         Where the cells had their centroids before all merges.
     changed, edited : (f,) bool
-        Faces that a merge has changed, in this round and in any; all are edited at first in a solid.
+        Faces that a merge has changed, in this round and in any.
     """
 
     def __init__(
         self,
+        mesh: Faces,
+        diagram: Diagram | None,
         points: np.ndarray,
         starts: np.ndarray,
         corners: np.ndarray,
@@ -150,17 +161,16 @@ class MergingCells:
         owner: np.ndarray,
         neighbor: np.ndarray,
         face_codes: np.ndarray,
-        diagram: Diagram,
-        half_face: np.ndarray,
-        small: float,
+        rows: np.ndarray,
     ) -> None:
-        self.points, self.extent = np.array(points, float), np.asarray(diagram.domain.extent, float)
-        self.diagram, self.half_face = diagram, half_face
+        self.domain, self.mesh, self.diagram, self.rows = mesh.domain, mesh, diagram, rows
+        self.points, self.extent = np.array(points, float), np.asarray(mesh.domain.extent, float)
         self.begin, self.count = starts[:-1].copy(), np.diff(starts)
         self.corners, self.codes = corners.copy(), codes
         self.owner, self.neighbor = owner.astype(np.int64), neighbor.astype(np.int64)
-        self.face_codes, self.n = face_codes, len(diagram)
-        self.sizes, self.centroids, self.small = np.cbrt(diagram.volumes), diagram.centroids, small
+        self.face_codes, self.n = face_codes, mesh.n_cells
+        self.centroids = mesh.measures.geometry.centroids if diagram is None else diagram.centroids
+        self.sizes = np.cbrt(mesh.volumes if diagram is None else diagram.volumes)
         self.limits = DefectLimits()
         v = len(points)
         self.walls, self.wall_sets = _sets_of_walls(starts, self.corners, self.neighbor, v)
@@ -174,7 +184,6 @@ class MergingCells:
         self.now_code = np.zeros(v, np.int64)
         self.touched = np.zeros(self.n, bool)
         self.changed, self.edited = np.zeros((2, len(self.owner)), bool)
-        self.edited[:] = diagram.domain.curved_walls  # there faces are not quite plane
         self.unwanted = np.zeros(len(self.owner), bool)
         self._places = [np.full(k, -1, np.int32) for k in (v, self.n, len(self.owner))]
 
@@ -191,19 +200,22 @@ class MergingCells:
     def geometry(self, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the centers and area vectors of `faces`, (3, k) each, on the owner's side of periodic seams.
 
-        Those of faces that no merge has changed are the diagram's, up to round-off.
+        Those of faces that no merge has changed are the diagram's, up to round-off, or those of the mesh.
         """
         centers, normals = np.empty((2, 3, len(faces)))
         rows = np.flatnonzero(~self.edited[faces])
-        centers[:, rows], normals[:, rows] = self._geometry_of_diagram(faces[rows])
+        centers[:, rows], normals[:, rows] = self._geometry_before(faces[rows])
         rows = np.flatnonzero(self.edited[faces])
         starts, places = self.face_corners(faces[rows])
         x = self.positions(self.corners[places], self.codes[places])
         centers[:, rows], normals[:, rows] = loop_geometry(x, starts)
         return centers, normals
 
-    def _geometry_of_diagram(self, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        d, half, i, j = self.diagram, self.half_face[faces], self.owner[faces], self.neighbor[faces]
+    def _geometry_before(self, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        if (d := self.diagram) is None:
+            center, vector = self.mesh.vectors
+            return center.take(self.rows[faces], axis=0).T, vector.take(self.rows[faces], axis=0).T
+        half, i, j = self.mesh.half_face[self.rows[faces]], self.owner[faces], self.neighbor[faces]
         normals = d.points.take(np.maximum(j, 0), axis=0).T + self.offsets(self.face_codes[faces])
         normals -= d.points.take(i, axis=0).T
         wall = np.flatnonzero(j < 0)
@@ -365,7 +377,7 @@ class MergingCells:
         targets[:, 0] = mean
         walls = self.walls[merges.vertices[np.maximum(anchor, 0)]]
         fixed = np.flatnonzero((anchor >= 0) & (walls > 0))
-        place = self.diagram.domain.onto_walls
+        place = self.domain.onto_walls
         for attempt in range(1 + _TRIES):
             there = targets[fixed, attempt]
             targets[fixed, attempt] = place(there, x[anchor[fixed]], walls[fixed], self.wall_sets)

@@ -52,7 +52,9 @@ def _made(diagram: Diagram, walls: WallShape, collapse: bool, parts: np.ndarray)
     outline = diagram.domain.outline if walls == "straight" else None
     if outline is None:
         mesh = faces_with_seams(diagram)
-        mesh = replace(mesh, points=mesh.points.astype(np.float64, copy=False), diagram=None)
+        points = mesh.points.astype(np.float64, copy=False)
+        if mesh.diagram is not None or points is not mesh.points:
+            mesh = replace(mesh, points=points, diagram=None)
         return _COLLAPSED[mesh.dim](mesh, diagram, parts, collapse)
     mesh = _in_polygon(diagram, outline, parts, collapse)
     found = []
@@ -108,14 +110,17 @@ def _collapsed_polyhedra(mesh: Faces, diagram: Diagram, parts: np.ndarray, colla
     from .solid_walls.mend import spoiled_near_walls, with_neighbors
 
     del parts
-    mesh = replace(mesh, corners=mesh.corners.astype(np.int32, copy=False))
+    corners = mesh.corners.astype(np.int32, copy=False)
+    if corners is not mesh.corners:
+        mesh = replace(mesh, corners=corners)
     # What short edges may become depends on the sides of a box; those of layers are wanted.
     whole = mesh.domain.uncut is mesh.domain and mesh.layer is None
     if not collapse or not whole:
         return mesh.compact()
-    suspects = find_suspects(mesh, diagram)
-    made = collapse_short(mesh, diagram, suspects=suspects)
-    if diagram.faces.diagram is not None:  # Voronoi cells are convex
+    known = diagram.faces.diagram
+    suspects = find_suspects(mesh, known)
+    made = collapse_short(mesh, known, suspects=suspects)
+    if known is not None:  # Voronoi cells are convex
         return made
     # Where OpenFOAM would reject collapsed cells at a surface, these and their neighbors stay as they are.
     held = np.zeros(mesh.n_cells, bool)
@@ -125,7 +130,7 @@ def _collapsed_polyhedra(mesh: Faces, diagram: Diagram, parts: np.ndarray, colla
             break
         held |= with_neighbors(mesh, rejected)
         free = ~(held[mesh.owner] | held[np.maximum(mesh.neighbor, 0)])
-        made = collapse_short(mesh, diagram, chosen=free, suspects=suspects)
+        made = collapse_short(mesh, None, chosen=free, suspects=suspects)
     return made
 
 

@@ -140,6 +140,18 @@ class Faces(Sealed):
         center, vector = face_vectors(self.points, self.starts, self.corners)
         return read_only(center), read_only(vector)
 
+    def take_vectors(self, other: Faces, rows: np.ndarray, changed: np.ndarray) -> None:
+        """Take `vectors` from the faces `rows` (f,) of another mesh, if it has computed them.
+
+        Those of faces that have `changed`, (f,) bool, are computed.
+        """
+        if "vectors" not in vars(other):
+            return
+        center, vector = (values.take(rows, axis=0) for values in other.vectors)
+        new = np.flatnonzero(changed)
+        center[new], vector[new] = face_vectors(self.points, *take_rows(self.starts, self.corners, new))
+        vars(self)["vectors"] = read_only(center), read_only(vector)
+
     @property
     def area(self) -> np.ndarray:
         """Area; length in 2D; (f,) float64."""
@@ -277,6 +289,14 @@ class Faces(Sealed):
         starts = np.concatenate([[0], np.cumsum(np.bincount(cells, minlength=self.n_cells))])
         return starts, np.argsort(cells, kind="stable")
 
+    def with_half_faces(self, half_face: np.ndarray) -> Faces:
+        """Return the same mesh with other `half_face` (f,), without a diagram; keep what follows from its corners."""
+        made = replace(self, half_face=half_face, diagram=None)
+        known = "vectors", "_geometry", "measures", "n_inner"
+        if self.diagram is None:
+            vars(made).update({name: vars(self)[name] for name in known if name in vars(self)})
+        return made
+
     def take_faces(self, kept: np.ndarray, **arrays: Any) -> Faces:
         """Return the mesh with the faces `kept` (indices or a mask) only, and with some other `arrays`."""
         rows = np.flatnonzero(kept) if kept.dtype == bool else kept
@@ -318,7 +338,9 @@ class Faces(Sealed):
             neighbor=neighbor.astype(np.int32),
             layer=None if self.layer is None else self.layer[cells],
         )
-        return taken.compact(), np.flatnonzero(np.bincount(corners))
+        made = taken.compact()
+        made.take_vectors(self, rows, turned)
+        return made, np.flatnonzero(np.bincount(corners))
 
     def compact(self) -> Faces:
         """Return the mesh without points that no face has."""

@@ -44,7 +44,9 @@ def rejected_at_walls(faces: Faces, judged: np.ndarray) -> np.ndarray:
 def _rejected(faces: Faces, judged: np.ndarray, doubtful: np.ndarray) -> np.ndarray:
     """Return which of the cells `judged` (n,) bool OpenFOAM rejects, (k,) int; it tests faces of `doubtful` cells."""
     kept = with_neighbors(faces, judged)
-    cells, part = np.flatnonzero(kept), faces.part(kept)[0]
+    if 2 * np.count_nonzero(kept) > len(kept):
+        kept[:] = True
+    cells, part = np.flatnonzero(kept), faces if kept.all() else faces.part(kept)[0]
     doubtful = doubtful[cells]
     tested = np.flatnonzero(doubtful[part.owner] | (doubtful[np.maximum(part.neighbor, 0)] & (part.neighbor >= 0)))
     return cells[rejected_cells(part, tested, judged[cells])]

@@ -350,16 +350,14 @@ def _collapsed(faces: Faces, sizes: np.ndarray, among: np.ndarray | None = None)
     Cells that are not `among` (n,) bool stay as they are, but for the vertices that they share with the others. Return
     also which cells have changed, (n,) bool.
     """
-    diagram = diagram_of(faces)
     examined = at_wall(faces)
     if among is not None:
         examined &= among
     chosen = examined[faces.owner] | examined[np.maximum(faces.neighbor, 0)]
-    made = collapse_short(diagram.faces, diagram, narrow_faces(diagram.faces, sizes, examined), chosen)
-    row = np.full(len(diagram.neighbors), -1)
-    row[diagram.faces.half_face] = np.arange(len(faces))
-    changed = changed_cells(diagram.faces, made)
-    return replace(made, half_face=faces.half_face[row[made.half_face]]), changed
+    numbered = faces.with_half_faces(np.arange(len(faces)))
+    made = collapse_short(numbered, None, narrow_faces(numbered, sizes, examined), chosen)
+    changed = changed_cells(numbered, made, with_neighbors(faces, examined, 2))
+    return made.with_half_faces(faces.half_face[made.half_face]), changed
 
 
 def _simplify(walls: np.ndarray, near: NearWalls, rejected: np.ndarray) -> None:
@@ -391,7 +389,7 @@ def diagram_of(faces: Faces) -> Diagram:
     back = places >= len(faces)
     half_face = np.empty(len(faces), np.int64)
     half_face[places[~back]] = np.flatnonzero(~back)
-    faces = replace(faces, half_face=half_face)
+    faces = faces.with_half_faces(half_face)
 
     @cache
     def loops() -> tuple[np.ndarray, np.ndarray]:
