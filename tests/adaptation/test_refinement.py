@@ -129,13 +129,6 @@ def test_equal_boundary_edges_bring_one_generator(ctx, side, count):
     assert domain.contains(finer).all()
 
 
-def test_count_is_four_times(ctx):
-    """A planar graph has nearly three edges for each cell, and the walls give the rest."""
-    points = patch.relaxed_points(900, 77, steps=5)
-    _, finer = refine(patch.make_engine(ctx), points, np.full(900, np.sqrt(0.75 / 3600)))
-    assert len(finer) == pytest.approx(3600, rel=0.01)
-
-
 def test_a_lattice_is_carried_over(ctx):
     """A hexagonal lattice is refined to that of half the spacing, away from walls."""
     a = 1 / 16

@@ -5,8 +5,6 @@ import pytest
 
 from clvoro.adaptation.density import Density
 from clvoro.adaptation.metric import Metric
-from clvoro.adaptation.refinement import Refinement
-from clvoro.geometry.box import Box
 from clvoro.solvers.linear_system import Limits
 from clvoro.solvers.volume_projection import Penalty, Targets, VolumeProjection
 from tests.reference import diagrams3d as reference3d
@@ -118,22 +116,3 @@ def test_projection_uses_the_derivative_of_the_volumes(double):
 
 
 # Refinement.
-
-
-def test_refined_body_centered_lattice(double):
-    """Middles of its edges make the lattice of half the spacing, all cells truncated octahedra."""
-    a, box = 1 / 6, Box((0, 0, 0), (1, 1, 1))
-    line = np.arange(6)
-    corner = np.stack(np.meshgrid(line, line, line, indexing="ij"), -1).reshape(-1, 3)
-    points = np.concatenate([corner + 0.25, corner + 0.75]) * a
-    t = patch.tessellate(double, points, box)
-    size = double.upload(np.full(len(points), a * 2 ** (-4 / 3)))
-    finer = Refinement(double).refine(box, t, size).get()
-    host = patch.fetch(patch.tessellate(double, finer, box))
-    inside = ((finer > 1.3 * a) & (finer < 1 - 1.3 * a)).all(axis=1)
-    assert inside.sum() > 500
-    assert (np.diff(host.starts)[inside] == 14).all()
-    assert host.volumes[inside] == pytest.approx(np.full(inside.sum(), (a / 2) ** 3 / 2))
-    surface = np.bincount(host.owners, host.face_measures)[inside]
-    quotient = 36 * np.pi * host.volumes[inside] ** 2 / surface**3
-    assert quotient == pytest.approx(np.full(inside.sum(), 0.753367), abs=1e-6)

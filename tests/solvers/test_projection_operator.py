@@ -18,7 +18,7 @@ class Given:
     def __init__(self, engine, box, share):
         self.box, self.n = box, 250 if box.dim == 3 and any(box.periodic) else 70
         self.fixed, rng = int(share * self.n), np.random.default_rng(5501)
-        self.engine = engine
+        self.engine, self.power = engine, 4 if share else 2
         self.t = patch.tessellate_box(engine, box, self.n, 5502)
         self.labels = rng.permutation(self.n)
         self.held = self.labels < self.fixed
@@ -45,7 +45,7 @@ class Given:
             Targets(*targets),
             displacement,
             u,
-            Penalty(EPS, QUALITY_SCALE, LOG_RATIO_SCALE),
+            Penalty(EPS, QUALITY_SCALE, LOG_RATIO_SCALE, power=self.power),
             Limits(tolerance, max_iterations),
             labels=self.engine.upload(self.labels, np.int32),
             fixed=self.fixed,
@@ -70,7 +70,7 @@ class Given:
             J -= np.einsum("ija,ja->ij", J, normal)[:, :, None] * normal
         J[:, self.held] = 0
         eps = np.minimum(EPS * (1 + (1 - worst) ** 2 / worst / QUALITY_SCALE**2), 3)
-        return J, eps / (1 + (self.log_ratio / LOG_RATIO_SCALE) ** 2)
+        return J, eps / (1 + (self.log_ratio / LOG_RATIO_SCALE) ** self.power)
 
 
 @pytest.fixture(

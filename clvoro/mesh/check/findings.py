@@ -135,6 +135,18 @@ class Check:
             if stop:
                 raise StopError
 
+    def compare(
+        self, name: str, given: np.ndarray, expected: np.ndarray, width: ArrayLike, source: str = "corners"
+    ) -> None:
+        """Record whether the numbers `given`, (k,) or (k, d), are those `expected` by a `source`, up to `width`."""
+        array = name.partition(" of ")[0].replace(" ", "_")
+        off = np.abs(given - expected) if given.ndim == 1 else np.linalg.norm(given - expected, axis=1)
+        self.note(
+            name,
+            np.maximum(off - width, 0),
+            lambda i: f"{array}[{i}] is {_written(given[i])}, expected {_written(expected[i])}, by its {source}",
+        )
+
     def shape(self, name: str, array: np.ndarray, shape: tuple[int, ...], kinds: str = "f") -> None:
         """Record whether an array has the expected shape and finite numbers."""
         fits = array.shape == shape and array.dtype.kind in kinds
@@ -147,3 +159,7 @@ class Check:
         if array.dtype.kind == "f":
             bad = ~np.isfinite(array).reshape(len(array), -1).all(axis=1)
             self.note("finite", bad, lambda i: f"{name}[{i}] is {array[i]}", stop=True)
+
+
+def _written(value: np.ndarray) -> str:
+    return f"{value:.17g}" if value.ndim == 0 else str(value)

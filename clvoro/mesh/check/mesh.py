@@ -14,6 +14,7 @@ import numpy as np
 import scipy
 
 from ..connectivity import take_rows
+from ..geometry import sum_rows
 from ..lookup import lifted, power_tree
 from .findings import ROUNDINGS, Check, Report, StopError
 from .polygon import check_cells, check_edges, check_outlines, hidden
@@ -134,13 +135,7 @@ def check_measures(check: Check, g: Rebuilt, positions: Doubts) -> None:
     across = np.where(d.shifts.any(axis=1), g.period_off, 0.0) * d.face_measures
     turned = across / g.spacings
     width = np.bincount(g.owner, doubts.measures + rounding + turned, n)
-    gap = np.stack([np.bincount(g.owner, d.face_measures * normals[:, k], n) for k in range(dim)], axis=1)
-    gap = np.linalg.norm(gap, axis=1)
-    check.note(
-        "measures close",
-        np.maximum(gap - width, 0),
-        lambda i: f"the measures of the faces of cell {i} do not close it, by {gap[i]:.3g}",
-    )
+    _check_sum(check, g.owner, d.face_measures[:, None] * normals, width)
     if d.domain.cuts_cells:  # corners alone give the places of cut faces
         return
     if d.is_power and dim == 2:
@@ -150,14 +145,19 @@ def check_measures(check: Check, g: Rebuilt, positions: Doubts) -> None:
         corner[g.cells] = d.vertices[g.corners] - d.points[g.cells]
         height = height - (corner[g.owner] * normals).sum(axis=1)
     volumes = np.bincount(g.owner, d.face_measures * height, n) / dim
-    gap = np.abs(d.volumes - volumes)
     # Corners of a cell at the limit of the precision may all be rounded to one point, and give no measures.
     width = doubts.volumes + np.bincount(g.owner, d.face_measures, n) * own
     width += np.bincount(g.owner, across, n) / (2 * dim)
+    check.compare("volumes", d.volumes, volumes, width, "faces and their measures")
+
+
+def _check_sum(check: Check, owner: np.ndarray, areas: np.ndarray, width: np.ndarray) -> None:
+    """Check that the vectors `areas` (m, d) of the faces of each cell add up to 0, up to `width` (n,)."""
+    gap = np.linalg.norm(sum_rows(owner, areas, len(check.diagram)), axis=1)
     check.note(
-        "volumes",
+        "measures close",
         np.maximum(gap - width, 0),
-        lambda i: f"volumes[{i}] is {d.volumes[i]:.17g}, the measures of its faces give {volumes[i]:.17g}",
+        lambda i: f"the measures of the faces of cell {i} do not close it, by {gap[i]:.3g}",
     )
 
 
@@ -351,12 +351,7 @@ def _check_geometry(check: Check, g: Rebuilt) -> None:
         ~(g.volumes >= -slack * (g.perimeters + slack)),
         lambda i: f"the corners of cell {i} go around clockwise (volume {g.volumes[i]:.4g})",
     )
-    excess = np.abs(d.volumes - g.volumes) - doubts.volumes - slack**domain.cell_dim
-    check.note(
-        "volumes",
-        np.maximum(excess, 0),
-        lambda i: f"volumes[{i}] is {d.volumes[i]:.17g}, its corners give {g.volumes[i]:.17g}",
-    )
+    check.compare("volumes", d.volumes, g.volumes, doubts.volumes + slack**domain.cell_dim)
     total = float(d.volumes.sum())
     border = domain.boundary_measure
     allowed = slack * (g.perimeters.sum() / np.sqrt(n) + border)
@@ -370,14 +365,9 @@ def _check_geometry(check: Check, g: Rebuilt) -> None:
         check_generators(check, g)
     else:
         check_measures(check, g, doubts)
-    off = np.linalg.norm(d.centroids - d.points - g.centroids, axis=1)
     # The error of a centroid is relative to the volume.
     doubt = slack + doubts.volumes * g.reach / np.maximum(g.volumes, 1e-300)
-    check.note(
-        "centroids",
-        np.maximum(off - doubt, 0),
-        lambda i: f"centroids[{i}] is {d.centroids[i]}, its corners give {d.points[i] + g.centroids[i]}",
-    )
+    check.compare("centroids", d.centroids, d.points + g.centroids, doubt)
     if domain.outline is not None:
         check_edges(check, domain.outline, g, slack)
         check_cells(check, domain.outline, g, slack)
@@ -395,31 +385,10 @@ def check_solid(check: Check, g: Rebuilt) -> None:
     faces, domain = d.faces, d.domain
     geometry = faces.measures.geometry
     check.note("volumes", ~(d.volumes > 0), lambda i: f"volumes[{i}] is {d.volumes[i]}, expected > 0")
-    off = np.abs(d.volumes - geometry.volumes) - slack * g.perimeters
-    check.note(
-        "volumes",
-        np.maximum(off, 0),
-        lambda i: f"volumes[{i}] is {d.volumes[i]:.17g}, its corners give {geometry.volumes[i]:.17g}",
-    )
-    off = np.linalg.norm(d.centroids - geometry.centroids, axis=1) - slack
-    check.note(
-        "centroids",
-        np.maximum(off, 0),
-        lambda i: f"centroids[{i}] is {d.centroids[i]}, its corners give {geometry.centroids[i]}",
-    )
-    off = np.abs(d.face_measures - g.measures) - slack * g.reach[g.owner]
-    check.note(
-        "face measures",
-        np.maximum(off, 0),
-        lambda f: f"face_measures[{f}] is {d.face_measures[f]:.17g}, its corners give {g.measures[f]:.17g}",
-    )
-    gap = np.stack([np.bincount(g.owner, g.areas[:, k], len(d)) for k in range(3)], axis=1)
-    gap = np.linalg.norm(gap, axis=1)
-    check.note(
-        "measures close",
-        np.maximum(gap - slack * g.reach, 0),
-        lambda i: f"the measures of the faces of cell {i} do not close it, by {gap[i]:.3g}",
-    )
+    check.compare("volumes", d.volumes, geometry.volumes, slack * g.perimeters)
+    check.compare("centroids", d.centroids, geometry.centroids, slack)
+    check.compare("face measures", d.face_measures, g.measures, slack * g.reach[g.owner])
+    _check_sum(check, g.owner, g.areas, slack * g.reach)
     _check_closed(check, g, slack)
     wall = faces.starts[faces.n_inner]
     corners = np.unique(faces.corners[wall:])
@@ -486,15 +455,7 @@ def _check_faces(check: Check, g: Rebuilt, slack: float, doubts: Doubts) -> None
     d, width = check.diagram, doubts.measures
     if not d.domain.curved:
         _check_closed(check, g, slack)
-    wrong = np.abs(d.face_measures - g.measures) - width
-    check.note(
-        "face measures",
-        np.maximum(wrong, 0),
-        lambda f: (
-            f"face_measures[{f}] of cell {g.owner[f]} is {d.face_measures[f]:.17g}, its corners give "
-            f"{g.measures[f]:.17g}"
-        ),
-    )
+    check.compare("face measures", d.face_measures, g.measures, width)
     middle = d.face_centroids - d.points[g.owner]
     off = np.linalg.norm(middle - g.middles, axis=1)
     if g.edges is not None:
@@ -514,7 +475,7 @@ def _check_faces(check: Check, g: Rebuilt, slack: float, doubts: Doubts) -> None
 def _check_closed(check: Check, g: Rebuilt, slack: float) -> None:
     """Check that the faces of each cell close it: at edges in 3D, and as a sum of vectors."""
     d = check.diagram
-    dim, n = d.domain.dim, len(d)
+    n = len(d)
     if g.edges is not None:
         face, a, b = g.edges
         key = (g.owner[face].astype(np.int64), np.minimum(a, b), np.maximum(a, b))
@@ -533,8 +494,7 @@ def _check_closed(check: Check, g: Rebuilt, slack: float) -> None:
                 f"from vertex {a[where[k]]} to {b[where[k]]}"
             ),
         )
-    gap = np.stack([np.bincount(g.owner, g.areas[:, k], minlength=n) for k in range(dim)], axis=1)
-    gap = np.linalg.norm(gap, axis=1)
+    gap = np.linalg.norm(sum_rows(g.owner, g.areas, n), axis=1)
     bound = np.full(n, slack)
     if g.edges is not None:
         # Between neighboring faces slits may remain, as wide as the round-off of their bisectors.
