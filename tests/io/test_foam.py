@@ -1,5 +1,6 @@
 """OpenFOAM's polyMesh: read back by its documentation, with the checks of checkMesh."""
 
+import collections
 import os
 import re
 import shutil
@@ -96,34 +97,31 @@ def test_order_is_upper_triangular(mesh):
     assert all(i < j for i, j in inner)
 
 
-def test_cells_are_closed_and_faces_point_away_from_their_owners(result, mesh):
-    points, faces, owner, neighbor, _ = mesh
-    n, inner = len(result.points), len(neighbor)
+def volumes_of_closed_cells(points, faces, owner, neighbor):
+    """Check that areas of each cell add up to 0, and that each of its edges is in two faces; return its volume."""
     areas = np.array([solids.loop_area(points[f]) for f in faces])
-    middles = np.array([points[f].mean(axis=0) for f in faces])
-    openness, volumes = np.zeros((n, 3)), np.zeros(n)
-    for k, i in enumerate(owner):
-        openness[i] += areas[k]
-        volumes[i] += areas[k] @ middles[k] / 3
-        if k < inner:
-            openness[neighbor[k]] -= areas[k]
-            volumes[neighbor[k]] -= areas[k] @ middles[k] / 3
+    # The mean of the corners of a concave face is not its centroid, but in its plane.
+    cones = (areas * np.array([points[f].mean(axis=0) for f in faces])).sum(axis=1) / 3
+    openness, volumes, edges = np.zeros((max(owner) + 1, 3)), np.zeros(max(owner) + 1), collections.Counter()
+    for cells, sign in ((owner, 1), (neighbor, -1)):
+        np.add.at(openness, cells, sign * areas[: len(cells)])
+        np.add.at(volumes, cells, sign * cones[: len(cells)])
+        for cell, face in zip(cells, faces, strict=False):
+            edges.update((cell, min(a, b), max(a, b)) for a, b in zip(face, face[1:] + face[:1], strict=True))
     # Round-off of sums of 20 products of coordinates below 4.
     assert np.abs(openness).max() < 1e-12
+    assert set(edges.values()) == {2}
+    return volumes
+
+
+def test_cells_are_closed_and_faces_point_away_from_their_owners(result, mesh):
+    points, faces, owner, neighbor, _ = mesh
+    volumes = volumes_of_closed_cells(points, faces, owner, neighbor)
     np.testing.assert_allclose(volumes, prism_volumes(result, points), rtol=0, atol=1e-11)
     generators = np.pad(result.points, ((0, 0), (0, 3 - result.points.shape[1])))
-    away = generators[neighbor] - generators[owner[:inner]]
-    assert (np.einsum("ij,ij->i", areas[:inner], away) > 0).all()
-
-
-def test_every_edge_of_a_cell_is_in_two_faces(result, mesh):
-    _, faces, owner, neighbor, _ = mesh
-    count = {}
-    for k, face in enumerate(faces):
-        for cell in [owner[k], *([neighbor[k]] if k < len(neighbor) else [])]:
-            for a, b in zip(face, face[1:] + face[:1], strict=True):
-                count[cell, min(a, b), max(a, b)] = count.get((cell, min(a, b), max(a, b)), 0) + 1
-    assert set(count.values()) == {2}
+    areas = np.array([solids.loop_area(points[f]) for f in faces[: len(neighbor)]])
+    away = generators[neighbor] - generators[owner[: len(neighbor)]]
+    assert (np.einsum("ij,ij->i", areas, away) > 0).all()
 
 
 def test_patches_are_the_walls(result, mesh):

@@ -10,8 +10,7 @@ import pytest
 
 import clvoro
 from clvoro import io
-from tests.io.test_foam import check_mesh, needs_openfoam, read
-from tests.reference import solids
+from tests.io.test_foam import check_mesh, needs_openfoam, read, volumes_of_closed_cells
 
 DOMAINS = {
     "2D, both": clvoro.Box((0, 0), (2, 1), periodic=True),
@@ -41,17 +40,7 @@ def cyclic(patches):
 @pytest.mark.sparse(2)
 def test_cells_are_whole_and_closed(result, mesh):
     points, faces, owner, neighbor, _ = mesh
-    box, n = result.diagram.domain, len(result.points)
-    areas = np.array([solids.loop_area(points[f]) for f in faces])
-    middles = np.array([points[f].mean(axis=0) for f in faces])
-    openness, volumes = np.zeros((n, 3)), np.zeros(n)
-    np.add.at(openness, owner, areas)
-    np.add.at(openness, neighbor, -areas[: len(neighbor)])
-    flux = np.einsum("ij,ij->i", areas, middles) / 3
-    np.add.at(volumes, owner, flux)
-    np.add.at(volumes, neighbor, -flux[: len(neighbor)])
-    # Round-off of sums of 20 products of coordinates below 4.
-    assert np.abs(openness).max() < 1e-12
+    box, volumes = result.diagram.domain, volumes_of_closed_cells(points, faces, owner, neighbor)
     depth = np.ptp(points[:, 2]) if box.dim == 2 else 1.0
     np.testing.assert_allclose(volumes, result.diagram.volumes * depth, rtol=0, atol=1e-11)
     assert volumes.sum() == pytest.approx(box.measure * depth, rel=1e-12)

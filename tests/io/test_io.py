@@ -289,23 +289,6 @@ def test_vtu_as_meshio_reads_it(result, tmp_path, compress, meshio_for_vtu):
     assert not generators[:, 2].any()
 
 
-def test_vtu_as_vtk_reads_it(result, tmp_path):
-    vtk = pytest.importorskip("vtk")
-    from vtk.util.numpy_support import vtk_to_numpy
-
-    path = tmp_path / "mesh.vtu"
-    io.save(result, path)
-    reader = vtk.vtkXMLUnstructuredGridReader()
-    reader.SetFileName(str(path))
-    sizes = vtk.vtkCellSizeFilter()
-    sizes.SetInputConnection(reader.GetOutputPort())
-    sizes.Update()
-    data = sizes.GetOutput().GetCellData()
-    areas = vtk_to_numpy(data.GetArray("Area"))
-    np.testing.assert_allclose(areas, result.diagram.volumes, rtol=1e-12)
-    np.testing.assert_array_equal(vtk_to_numpy(data.GetArray("error")), result.size_error)
-
-
 def test_vtu_of_many_blocks(tmp_path, result, monkeypatch, meshio_for_vtu):
     # 40 sizes are 320 bytes: full blocks only, a partial last block, a single block.
     for block in (32, 96, 320, 1000):
