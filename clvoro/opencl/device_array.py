@@ -16,7 +16,7 @@ import numpy as np
 import pyopencl as cl
 import pyopencl.array as cla
 
-from .memory_limits import check_allocation
+from .memory_limits import new_buffer
 
 _ATTRIBUTES = {
     "queue",
@@ -172,12 +172,10 @@ def make_array(
         shape = (int(shape),)  # type: ignore[arg-type]
     size = math.prod(shape)
     bytes_ = size * dtype.itemsize
-    if data is None:
-        check_allocation(queue.device, bytes_)
+    if data is None and bytes_:
+        data = new_buffer(queue, bytes_)
     if not _QUICK:
         return DeviceArray(queue, shape, dtype, data=data, offset=offset)
-    if data is None and bytes_:
-        data = cl.Buffer(queue.context, cl.mem_flags.READ_WRITE, bytes_)
     strides, step = (), dtype.itemsize
     for length in reversed(shape):
         strides, step = (step, *strides), step * max(1, length)

@@ -5,15 +5,24 @@ from __future__ import annotations
 import contextlib
 import math
 import os
+import re
+import threading
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
 import pyopencl as cl
 
-from ..errors import MemoryLimitError
+from ..errors import InputError, MemoryLimitError
 
 GROUPS, OWN_GROUPS = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
 """Linux's files with the limits of control groups, and with those of this process."""
+VARIABLE = "CLVORO_MEMORY_LIMIT"
+"""Environment variable with the bytes that this process may take of each device."""
+TAKEN: Counter[cl.Device] = Counter()
+MOST_TAKEN: Counter[cl.Device] = Counter()
+"""Bytes of all arrays on each device, now and at most so far; counted if there is a limit."""
+_counting = threading.RLock()
 
 
 def in_bytes(amount: float) -> str:
@@ -22,10 +31,60 @@ def in_bytes(amount: float) -> str:
     return f"{amount / 2 ** (10 * power):.3g} {('bytes', 'KiB', 'MiB', 'GiB')[power]}"
 
 
+def memory_limit() -> float:
+    """Return the bytes that `VARIABLE` lets this process take of each device; infinite if it is not set.
+
+    Raises
+    ------
+    InputError
+        If it is no number of bytes.
+    """
+    text = os.environ.get(VARIABLE, "").strip()
+    found = re.fullmatch(r"(\d+\.?\d*) *([KMGT]?)(i?B)?", text, re.IGNORECASE)
+    if text and not found:
+        raise InputError(f"{VARIABLE} is {text!r}, expected a number of bytes, such as 8GiB; unset it for no limit")
+    return float(found[1]) * 2 ** (10 * " KMGT".index(found[2].upper() or " ")) if found else math.inf
+
+
 def available_memory(device: cl.Device) -> float:
-    """Return the memory of `device` in bytes; for a CPU at most the limit of this process."""
-    own = device.global_mem_size
+    """Return the memory of `device` in bytes, at most `memory_limit`; for a CPU at most the limit of this process."""
+    own = min(device.global_mem_size, memory_limit())
     return min(own, host_memory()) if device.type & cl.device_type.CPU else own
+
+
+class _CountedBuffer(cl.Buffer):
+    """A buffer whose bytes count in `TAKEN` as long as it exists."""
+
+    def __init__(self, context: cl.Context, size: int) -> None:
+        self._device, self._bytes = context.devices[0], size
+        with _counting:
+            TAKEN[self._device] += size
+            MOST_TAKEN[self._device] = max(MOST_TAKEN[self._device], TAKEN[self._device])
+        super().__init__(context, cl.mem_flags.READ_WRITE, size)
+
+    def __del__(self) -> None:
+        with _counting:
+            TAKEN[self._device] -= self._bytes
+
+
+def new_buffer(queue: cl.CommandQueue, size: int) -> cl.Buffer:
+    """Return a buffer of `size` bytes with arbitrary content.
+
+    Raises
+    ------
+    MemoryLimitError
+        If the device does not allocate so large a buffer, or this process would take more than `memory_limit`.
+    """
+    check_allocation(queue.device, size)
+    limit = memory_limit()
+    if limit == math.inf:
+        return cl.Buffer(queue.context, cl.mem_flags.READ_WRITE, size)
+    if TAKEN[queue.device] + size > limit:
+        raise MemoryLimitError(
+            f"an array needs {in_bytes(size)}, and all arrays have {in_bytes(TAKEN[queue.device])}, expected at most "
+            f"{in_bytes(limit)}, as {VARIABLE} says; allow more, or use a larger size, n_cells or dtype='float32'"
+        )
+    return _CountedBuffer(queue.context, size)
 
 
 def largest_allocation(device: cl.Device) -> int:

@@ -166,7 +166,6 @@ class Workspace:
     def _allocate(self, size: int, used: set[int]) -> int:
         """Make a buffer of at least `size` bytes, with those called `used` in use; return its number."""
         device = self._queue.device
-        memory_limits.check_allocation(device, size)
         most = max(self._most, self._path[-1].needed + size)
         held = sum(size for size, _ in self._sizes)
         free = [entry for entry in self._sizes if entry[1] not in used]
@@ -180,6 +179,6 @@ class Workspace:
             self._slack *= SLACK
         size = max(size, min(size + size // SPARE, memory_limits.largest_allocation(device)))
         self._made += 1
-        self._buffers[self._made] = cl.Buffer(self._queue.context, cl.mem_flags.READ_WRITE, size)
+        self._buffers[self._made] = memory_limits.new_buffer(self._queue, size)
         insort(self._sizes, (size, self._made))
         return self._made

@@ -1,5 +1,6 @@
 """Runs that parts of a domain share: in threads, and over the ranks of MPI."""
 
+import gc
 import importlib.util
 import json
 import os
@@ -31,6 +32,7 @@ from clvoro.errors import (
     SizeErrorWarning,
 )
 from clvoro.io import arrays
+from clvoro.opencl import memory_limits
 from clvoro.opencl.engine import Engine
 from clvoro.opencl.peers import Peers
 from clvoro.opencl.threads import Team
@@ -190,6 +192,23 @@ def test_parts_hold_what_one_device_does_not(ctx, monkeypatch):
     needed = [estimates.check_memory(engine, 1e6) for engine in engines]
     assert 0.1 < needed[1] / needed[0] < 0.2
     given = clvoro.Box((0, 0), (1, 1)), 0.03
+    adapter, limit = clvoro.Adapter(ctx), memory_limits.VARIABLE
+    needed = adapter.memory_needed(*given)
+    with monkeypatch.context() as patch:
+        patch.setenv(limit, str(needed))
+        adapter.run(*given, "fast").diagram.vertices  # noqa: B018
+        assert needed / 2 < memory_limits.MOST_TAKEN[ctx.devices[0]] <= needed
+        patch.setenv(limit, f"{needed / 2**11:.3f} KiB")
+        with pytest.raises(MemoryLimitError, match="the size field requires"):
+            adapter.run(*given, "fast")
+        patch.setattr(estimates, "available_memory", lambda _: np.inf)
+        with pytest.raises(MemoryLimitError, match="as CLVORO_MEMORY_LIMIT says"):
+            clvoro.Adapter(ctx).run(*given, "fast")
+        patch.setenv(limit, "much")
+        with pytest.raises(InputError, match="'much', expected a number of bytes"):
+            clvoro.Adapter(ctx).run(*given, "fast")
+    gc.collect()
+    assert memory_limits.TAKEN[ctx.devices[0]] < memory_limits.MOST_TAKEN[ctx.devices[0]]
     alone, few = (estimates.estimate_memory(clvoro.Adapter(ctx)._engine_for(given[0]), n) for n in (1111, 700))
     monkeypatch.setattr(estimates, "available_memory", lambda _: (few + alone) / 2)
     with pytest.raises(MemoryLimitError):
