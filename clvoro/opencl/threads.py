@@ -89,14 +89,25 @@ class Threads(Peers):
         given = self._table.hand_over(self.number, [np.array(values) for values in sent])
         return [arrays[self.number] for arrays in given]
 
-    def swap(self, sent: np.ndarray, sent_sizes: np.ndarray, received: np.ndarray, sizes: np.ndarray) -> None:
-        """Hand over a copy of the array, of which each part takes its slice."""
+    def swap(
+        self,
+        sent: np.ndarray,
+        sent_sizes: np.ndarray,
+        received: np.ndarray,
+        sizes: np.ndarray,
+        values: np.ndarray | None = None,
+    ) -> list[np.ndarray]:
+        """Hand over a copy of the array, of which each part takes its slice, and of `values`."""
         self.exchanges += 1
-        ends, to = np.cumsum(sent_sizes).tolist(), 0
-        for rows, others in self._table.hand_over(self.number, (np.array(sent), ends)):
+        self.reductions += values is not None
+        ends, to, found = np.cumsum(sent_sizes).tolist(), 0, []
+        own = None if values is None else np.array(values)
+        for rows, others, gathered in self._table.hand_over(self.number, (np.array(sent), ends, own)):
             first, last = others[self.number - 1] if self.number else 0, others[self.number]
             received[to : to + last - first] = rows[first:last]
             to += last - first
+            found.append(gathered)
+        return [] if values is None else found
 
     def fail(self, error: BaseException) -> None:
         """Let all calls of other threads, and further ones of this thread, raise an error."""
