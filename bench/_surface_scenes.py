@@ -115,6 +115,40 @@ def narrow_faults() -> Scene:
     return CUBE.with_surfaces(parts), 0.08, {"region-0": 0.425, "region-3": 0.075}
 
 
+def fault_network() -> Scene:
+    """Return three steep planes that cross in pairs."""
+    top = np.array([0.5, 0.5, 2.2])
+    lines = 3 * (np.array([(0.2, 0.2, 0), (0.8, 0.3, 0), (0.4, 0.8, 0)]) - top)
+    faults = {}
+    for k, name in enumerate("abc"):
+        one, other = lines[k], lines[k - 1]
+        quarters = [(one, other), (other, -one), (-one, -other), (-other, one)]
+        faults[name] = joined(*(sheet(top, top + u, top + u + v, top + v) for u, v in quarters))
+    return CUBE.with_surfaces(faults), 0.07, {}
+
+
+def slanted_porous() -> Scene:
+    """Return a porous zone across a duct, at 60 degrees to its axis."""
+    turn, x = math.radians(30), np.array([(x, y, z) for x in (-0.2, 0.2) for y in (-1, 1) for z in (-1, 1)])
+    x = x @ np.array([(math.cos(turn), 0, -math.sin(turn)), (0, 1, 0), (math.sin(turn), 0, math.cos(turn))])
+    sides = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    zone = joined(*(sheet(*(x[list(side)] + (1.5, 0.5, 0.5))) for side in sides))
+    return Box((0, 0, 0), (3, 1, 1)).with_surfaces({"porous": zone}), 0.08, {"porous": 0.4 / math.cos(turn)}
+
+
+def battery() -> Scene:
+    """Return six cells of a battery in a coolant above a cold plate."""
+    parts = {
+        f"cell-{3 * j + i + 1}": Solid.cylinder((x, y, 0.4), (x, y, 1.1), 0.17, edge=0.03)
+        for j, y in enumerate((0.27, 0.73))
+        for i, x in enumerate((0.3, 0.75, 1.2))
+    }
+    volumes = dict.fromkeys(parts, math.pi * 0.17**2 * 0.7)
+    plate = {"plate": Solid.box((-0.1, -0.1, -0.1), (1.6, 1.1, 0.2))}
+    domain = Box((0, 0, 0), (1.5, 1, 1.3)).with_surfaces(parts | plate)
+    return domain, graded(domain, 0.05, 0.1), volumes | {"plate": 0.3}
+
+
 def aquifer() -> Scene:
     """Return three beds with a lens of clay in the middle one."""
     lens, volume = lens_at((2, 2, 0.5), 0.8, 0.22)
@@ -147,6 +181,9 @@ SCENES: dict[str, Callable[[], Scene]] = {
     "filter in a pipe": filter_in_pipe,
     "two faults": faults,
     "narrow faults": narrow_faults,
+    "fault network": fault_network,
+    "slanted porous zone": slanted_porous,
+    "battery": battery,
     "aquifer with a lens": aquifer,
     "heaters": heaters,
     "cube": lambda: within(CUBE, boxes(((0.3, 0.3, 0.3), (0.7, 0.7, 0.7))), 0.1),

@@ -21,6 +21,9 @@ from ..mesh.diagram import Diagram
 from ..mesh.read_only import read_only
 from .tuning import AT_WALL, BEHIND_WALL, CANDIDATES, CLEARINGS, CLOSE, ON_WALL
 
+_ROUND_OFF = 1e-5
+"""Largest distance of fixed generators from their positions by round-off in single precision, over the extent."""
+
 
 def check_fixed(fixed: object, domain: Domain, real: np.dtype) -> np.ndarray:
     """Return positions of fixed generators as a float64 array (k, d); k is 0 for None and for empty arrays.
@@ -289,10 +292,11 @@ def clear_balls(
 
 
 def put_back(diagram: Diagram, fixed: np.ndarray) -> None:
-    """Give the first generators of `diagram` the positions `fixed` (k, d) of the caller, without round-off."""
+    """Give the first generators of `diagram` the positions `fixed` (k, d) without round-off, but not moved ones."""
     if len(fixed):
         points = diagram.points.copy()
-        points[: len(fixed)] = fixed
+        near = np.abs(points[: len(fixed)] - fixed).max(axis=1) < _ROUND_OFF * diagram.domain.extent.max()
+        points[: len(fixed)][near] = fixed[near]
         diagram._arrays["points"] = read_only(points)
 
 

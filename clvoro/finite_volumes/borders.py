@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ..errors import InputError
 from ..geometry.solid.creases import connect
 from ..geometry.surfaces.sheets import Sheets
 from ..mesh.connectivity import distinct, following, take_rows
@@ -14,6 +16,7 @@ from ..mesh.diagram import Diagram
 from ..mesh.faces import Faces
 from .collapse import collapse_short
 from .gate import rejected_cells
+from .moves import fewest_rejected, moved
 from .solid_walls.mend import NARROW, cells_of, narrow_faces, with_neighbors
 from .solid_walls.mesh import diagram_of
 
@@ -30,22 +33,77 @@ _ROUNDS = 4
 """How often vertices at walls are moved to the surface, and back to the walls."""
 
 
-def on_surfaces(diagram: Diagram, sheets: Sheets) -> Diagram:
+@dataclass(frozen=True)
+class _OnSurfaces:
+    """A mesh whose faces lie on surfaces.
+
+    Attributes
+    ----------
+    diagram : Diagram
+    rejected : (k,) int
+        The cells near surfaces that OpenFOAM rejects.
+    """
+
+    diagram: Diagram
+    rejected: np.ndarray
+
+    @property
+    def home(self) -> np.ndarray:
+        """Return the generator of each cell, (n,) int."""
+        home = self.diagram.home
+        return np.arange(len(self.diagram)) if home is None else np.where(home < 0, -1 - home, home)
+
+
+def on_surfaces(
+    diagram: Diagram, sheets: Sheets, points: np.ndarray, sizes: np.ndarray, remake: Callable[[np.ndarray], Diagram]
+) -> Diagram:
     """Return a mesh whose faces between cells on both sides of `sheets` lie on them.
 
     Pairs of generators are mirror images in tangent planes. The face between such a pair lies on the surface where that
-    is flat. Elsewhere it is near the surface, with narrow faces between cells of different pairs around it.
+    is flat. Elsewhere it is near the surface, with narrow faces between cells of different pairs around it. Where
+    OpenFOAM would reject cells, generators there are moved a little, and the mesh is made again.
+
+    Parameters
+    ----------
+    diagram : Diagram
+    sheets : Sheets
+    points : (n, 3) float
+        The generators of `diagram`.
+    sizes : (n,) float
+        h at the generators.
+    remake : callable
+        Returns the diagram of other generators (n, 3).
     """
+    domain = diagram.domain
+
+    def depth(x: np.ndarray) -> np.ndarray:
+        return np.where(domain.contains(x), domain.boundary_distance(x), -1.0)
+
+    def again(best: _OnSurfaces, rows: np.ndarray, move: int) -> _OnSurfaces | None:
+        mesh, x = best.diagram, points.copy()
+        own = slice(None) if mesh.home is None else mesh.home >= 0
+        x[best.home[own]] = mesh.points[own]
+        try:
+            return _made(remake(moved(domain, depth, x, sizes, rows, move)), sheets)
+        except InputError:
+            return None
+
+    return fewest_rejected(_made(diagram, sheets), lambda a: a.home[a.rejected], again, len(points)).diagram
+
+
+def _made(diagram: Diagram, sheets: Sheets) -> _OnSurfaces:
+    """Move the faces of a diagram between cells on both sides of surfaces onto them."""
+    none = np.zeros(0, np.int64)
     rows = diagram.border_faces
     if not len(rows):
-        return diagram
+        return _OnSurfaces(diagram, none)
     faces = diagram.faces
     h = np.cbrt(diagram.volumes)
     of_face = np.minimum(h[faces.owner[rows]], h[faces.neighbor[rows]])
     vertices, size = _vertices(faces, rows, of_face)
     small = faces.area[rows] < _SMALL * of_face**2
     if not small.any() and (sheets.distance(faces.points[vertices]) < _FLAT * size).all():
-        return diagram
+        return _OnSurfaces(diagram, none)
     mesh = replace(faces, diagram=None, points=faces.points.astype(np.float64), corners=faces.corners.astype(np.int32))
     if small.any():
         mesh = _with_pairs_only(mesh, rows, small, vertices)
@@ -71,7 +129,8 @@ def on_surfaces(diagram: Diagram, sheets: Sheets) -> Diagram:
             made, rejected, tried = trial, left, 0
         else:
             tried += 1
-    return made
+    made.home = np.arange(len(made)) if diagram.home is None else diagram.home
+    return _OnSurfaces(made, rejected)
 
 
 def _rejected(diagram: Diagram) -> np.ndarray:

@@ -86,7 +86,7 @@ class Diagram(MeshOutput):
         round-off.
     home : (n,) int or None
         In a solid the row i of each cell's generator among those that the mesh was made of; -1 - i for further parts
-        of its cell. None elsewhere: cell i is that of generator i.
+        of its cell. Beside surfaces inside a box the rows of the cells. None elsewhere: cell i is that of generator i.
     weights : (n,) float64
         Weights w of the generators in a power diagram, in the square of the domain's unit of length. Zeros in a Voronoi
         diagram.

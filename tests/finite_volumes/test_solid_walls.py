@@ -14,14 +14,7 @@ from clvoro.errors import InputError
 from clvoro.finite_volumes.solid_walls import mend
 from clvoro.finite_volumes.solid_walls.cures import Cures
 from clvoro.finite_volumes.solid_walls.editing import judge
-from clvoro.finite_volumes.solid_walls.mesh import (
-    _Maker,
-    _moved,
-    diagram_of,
-    off_middle,
-    outer_generators,
-    solid_diagram,
-)
+from clvoro.finite_volumes.solid_walls.mesh import _Maker, diagram_of, off_middle, outer_generators, solid_diagram
 from clvoro.finite_volumes.solid_walls.near_walls import NearWalls
 from clvoro.finite_volumes.solid_walls.wall_surface import WallSurface
 from clvoro.mesh.connectivity import following
@@ -313,21 +306,6 @@ def test_cures_are_repeated_where_cells_are_the_same(ctx):
     points[v] += 1e-3 * H
     again = Cures(cures.surface, replace(other, points=points.copy()), cures.names, cures.sizes, cures)
     assert len(again.edits.taken) < len(cures.edits.taken)
-
-
-def test_generators_of_rejected_cells_are_moved_inside_of_the_solid():
-    """So are those beside them. One in a corner is moved away from it; where there is no room, it stays."""
-    row = 0.5 + np.array([[0, 0, 0], [1.2 * H, 0, 0], [1.4 * H, 0, 0]])
-    moved = _moved(WallSurface(clvoro.Solid.box((0, 0, 0), (1, 1, 1))), row, np.full(3, H), np.array([0]), 0)
-    assert (moved != row).any(axis=1).tolist() == [True, True, False]
-    solid = clvoro.Solid.box((0, 0, 0), (1, 1, 0.25 * H))
-    x = np.array([[0.5, 0.5, 0.12 * H], [0.5, 0.2, 0.13 * H], [0.12 * H, 0.12 * H, 0.12 * H], [0.3, 0.3, 0.05 * H]])
-    for move in range(3):
-        moved = _moved(WallSurface(solid), x, np.full(4, H), np.array([0, 2, 3]), move)
-        away = np.linalg.norm(moved - x, axis=1) / H
-        assert away[1] == 0
-        assert all(a == 0 or a == pytest.approx(0.15) for a in away)
-        assert (solid.signed_distance(moved[away > 0]) < 0).all()
 
 
 def test_mergers_losses_and_collapses_change_what_they_name(ctx):

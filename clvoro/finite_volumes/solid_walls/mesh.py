@@ -15,6 +15,7 @@ from ...mesh.connectivity import distinct, following, take_ranges, take_rows
 from ...mesh.diagram import Diagram
 from ...mesh.faces import Faces
 from ..collapse import collapse_short
+from ..moves import FEW, fewest_rejected, moved
 from .chains import Crossings, cross_cells
 from .cures import Cures, cured
 from .mend import at_wall, changed_cells, narrow_faces, rejected_at_walls, touching_walls, with_neighbors
@@ -42,16 +43,8 @@ across it, over h."""
 _AROUND = 0.85
 """Generators nearer to a concave crease than this share of h stay: the faces between their cells meet in it."""
 _GOLDEN = (5**0.5 - 1) / 2
-_FEW = 0.03
-"""Largest share of generators without a cell; a solid with more of them is refused."""
 _PATIENCE, _ATTEMPTS = 3, 8
 """How often a mesh is made again without fewer rejected cells than before, and at all."""
-_MOVES = 4
-"""How often generators of rejected cells are moved, at most."""
-_MOVE, _BESIDE = 0.15, 1.3
-"""How far they are moved, over h. Generators nearer to them than the second number, over h, are moved as well."""
-_DEEP = 0.1
-"""Least depth of moved generators in the solid, over h."""
 _MISSED = 0.1
 """A crossing of a crease becomes a vertex of a chord on its face that is farther from it than this share of h."""
 
@@ -185,22 +178,25 @@ def solid_diagram(
         and the first place.
     """
     near = NearWalls.of(surface, points, sizes, whole(points))
-    best = made = _Attempts(surface, near, np.full(len(near.sizes), EXACT, np.int8), None, tell)
-    for move in range(_MOVES):
-        rows = np.setdiff1d(near.numbers[best.made.home[best.made.rejected]], [-1])
-        if not 0 < len(rows) <= _FEW * len(points) or made.are_spent:
-            break
-        moved = _moved(surface, near.points, sizes, rows, move)
-        other = NearWalls.of(surface, moved, sizes, whole(moved))
+    last = _Attempts(surface, near, np.full(len(near.sizes), EXACT, np.int8), None, tell)
+
+    def again(best: _Attempts, rows: np.ndarray, move: int) -> _Attempts | None:
+        nonlocal last
+        if last.are_spent:
+            return None
+        points = moved(surface.solid, lambda x: -surface.closest(x)[2], best.near.points, sizes, rows, move)
+        near = NearWalls.of(surface, points, sizes, whole(points))
         walls = np.full(len(points) + 1, EXACT, np.int8)
-        walls[near.numbers] = best.walls
+        walls[best.near.numbers] = best.walls
         walls[rows] = EXACT
         try:
-            made = _Attempts(surface, other, walls[other.numbers], best.made.cures, tell, f", moved {move + 1}")
+            last = _Attempts(surface, near, walls[near.numbers], best.made.cures, tell, f", moved {move + 1}")
         except InputError:
-            break
-        if len(made.made.rejected) < len(best.made.rejected):
-            best, near = made, other
+            return None
+        return last
+
+    best = fewest_rejected(last, lambda a: a.near.numbers[a.made.home[a.made.rejected]], again, len(points))
+    near = best.near
     mesh, points = best.made, near.points
     rejected = mesh.faces.generators[mesh.rejected]
     tell("cells without walls")
@@ -223,22 +219,6 @@ def solid_diagram(
     return diagram
 
 
-def _moved(surface: WallSurface, points: np.ndarray, sizes: np.ndarray, rows: np.ndarray, move: int) -> np.ndarray:
-    """Return all generators. Those of `rows` (k,) int and near these are moved, but stay in the solid.
-
-    The number `move` of the attempt gives the directions.
-    """
-    beside = scipy.spatial.KDTree(points).query_ball_point(points[rows], _BESIDE * sizes[rows])
-    rows, points = np.unique(np.concatenate(beside).astype(np.int64)), points.copy()
-    away = np.random.default_rng(move).normal(size=(len(rows), 3))
-    away *= (_MOVE * sizes[rows] / np.linalg.norm(away, axis=1))[:, None]
-    for sign in (1, -1):
-        inside = surface.closest(points[rows] + sign * away)[2] < -_DEEP * sizes[rows]
-        points[rows[inside]] += sign * away[inside]
-        rows, away = rows[~inside], away[~inside]
-    return points
-
-
 class _Attempts:
     """The mesh of the fewest rejected cells of several, with ever simpler walls where cells are rejected.
 
@@ -255,6 +235,7 @@ class _Attempts:
 
     Attributes
     ----------
+    near : NearWalls
     made : _Made
         The mesh.
     walls : (p + 1,) int8
@@ -277,6 +258,7 @@ class _Attempts:
         tell: Callable[[str], object],
         label: str = "",
     ) -> None:
+        self.near = near
         walls, best, since = walls.copy(), None, 0
         for attempt in range(1, _ATTEMPTS + 1):
             if since == _PATIENCE:
@@ -308,7 +290,7 @@ class _Attempts:
 def _check_lost(surface: WallSurface, near: NearWalls, home: np.ndarray) -> None:
     """Raise an `InputError` if many generators have no cell; `home` is that of the cells."""
     lost = np.setdiff1d(np.arange(len(near.rows)), home)
-    if len(lost) > _FEW * len(near.points):
+    if len(lost) > FEW * len(near.points):
         place = format_point(near.generators[lost[0]])
         raise InputError(
             f"{surface.solid} is too thin for cells of this size: {len(lost)} generators have no cell, the first at "

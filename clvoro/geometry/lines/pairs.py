@@ -488,11 +488,14 @@ def _wall_directions(domain: Domain, nodes: np.ndarray) -> dict[int, list[float]
     return found
 
 
-def choose_angles(chords: list[float], walls: list[float], separation: float = _SEPARATION) -> np.ndarray:
+def choose_angles(
+    chords: list[float], walls: list[float], separation: float = _SEPARATION, least: float = _ANGLES[0]
+) -> np.ndarray:
     """Return for chords in the given directions around a node the angle between each and its generators, (k,).
 
     They are as close to 45 degrees as may be. Two neighboring chords share a generator, whose angles to both are equal
     parts of those chords, or their generators are apart by at least `separation`. Beside walls there is room for one.
+    Angles are at least `least`, if that is possible.
     """
     k = len(chords)
     order = np.argsort(chords, kind="stable")
@@ -516,7 +519,7 @@ def choose_angles(chords: list[float], walls: list[float], separation: float = _
             shared = any(row[a] and row[b] and abs(r - width) < 1e-12 for row, r in zip(rows, right, strict=True))
             if not shared:
                 misfit += max(0.0, x[a] + x[b] - max(width - separation, 0) - 1e-9)
-        misfit += np.maximum(_ANGLES[0] - x, 0).sum() + np.maximum(x - most - 1e-9, 0).sum()
+        misfit += np.maximum(least - x, 0).sum() + np.maximum(x - most - 1e-9, 0).sum()
         cost = float(((x - math.radians(45)) ** 2).sum()) + 1e3 * float(misfit)
         if cost < best:
             best, angles = cost, x

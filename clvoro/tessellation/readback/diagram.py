@@ -41,34 +41,55 @@ def fetch_diagram(engine: Engine, domain: Domain, t: Tessellation, labels: cla.A
     copy : bool
         Copy the arrays of `t`. Without a copy the caller must not reuse these buffers.
     """
+    sheets = None if domain.borders is None else domain.borders.sheets
     if domain.curved_walls:
         from .solid import make_mesh, read_generators
 
+        solid = cast("Solid", domain)
         points, sizes = read_generators(domain, t, labels)
         del t, labels  # memory for another diagram
-        return _on_borders(make_mesh(engine, cast("Solid", domain), points, sizes))
-    reader = _DiagramReader(engine, domain, t, labels, copy)
-    if reader.whole.round_off & UNEVEN:
-        assert reader.faces
-    return _on_borders(reader.diagram())
+        diagram = make_mesh(engine, solid, points, sizes)
 
+        def again(points: np.ndarray) -> Diagram:
+            return make_mesh(engine, solid, points, sizes, warns=False, spread=False)
 
-def _on_borders(diagram: Diagram) -> Diagram:
-    """Return a mesh whose faces lie on the borders inside the domain, where those of `diagram` are only near them."""
-    borders = diagram.domain.borders
-    sheets = None if borders is None else borders.sheets
-    return diagram if sheets is None else on_surfaces(diagram, sheets)
+    else:
+        diagram = _read(engine, domain, t, labels, copy)
+        if sheets is None:
+            return diagram
+        points, sizes = diagram.points, np.cbrt(diagram.volumes)
+
+        def again(points: np.ndarray) -> Diagram:
+            stages = TessellationStages(engine)
+            made = _read(engine, domain, *_tessellate(stages, domain, points))
+            stages.release()
+            return made
+
+    return diagram if sheets is None else on_surfaces(diagram, sheets, points, sizes, again)
 
 
 def make_diagram(stages: TessellationStages, domain: Domain, points: np.ndarray) -> Diagram:
     """Return the diagram of `points` (n, d), which are in `domain`, made on the device."""
+    return fetch_diagram(stages.engine, domain, *_tessellate(stages, domain, points))
+
+
+def _tessellate(stages: TessellationStages, domain: Domain, points: np.ndarray) -> tuple[Tessellation, cla.Array]:
+    """Return the tessellation of `points` (n, d) on the device, and its labels (n,): the rows of the points."""
     engine, n = stages.engine, len(points)
     binned = stages.bins.build(domain, engine.upload(domain.place(points, engine.real)), n)
     labels, sorted_points = binned.items[:n].copy(), binned.points[:n].copy()
     tessellator = Tessellator(stages, domain)
     stages.bins.renumber(binned, n)
     t = tessellator.final(tessellator.tessellate(sorted_points, n, exact=True, binned=binned, complete=True))
-    return fetch_diagram(engine, domain, t, labels)
+    return t, labels
+
+
+def _read(engine: Engine, domain: Domain, t: Tessellation, labels: cla.Array, copy: bool = True) -> Diagram:
+    """Return the cells of `t`, see `fetch_diagram`."""
+    reader = _DiagramReader(engine, domain, t, labels, copy)
+    if reader.whole.round_off & UNEVEN:
+        assert reader.faces
+    return reader.diagram()
 
 
 def order_of(labels: np.ndarray) -> np.ndarray:

@@ -45,16 +45,20 @@ def mesh_volumes(engine: Engine, domain: Domain, t: Tessellation, labels: cla.Ar
     return np.bincount(np.where(mesh.home < 0, -1 - mesh.home, mesh.home), mesh.volumes, t.n)
 
 
-def make_mesh(engine: Engine, domain: Solid, points: np.ndarray, sizes: np.ndarray, warns: bool = True) -> Diagram:
+def make_mesh(
+    engine: Engine, domain: Solid, points: np.ndarray, sizes: np.ndarray, warns: bool = True, spread: bool = True
+) -> Diagram:
     """Return the mesh of a solid by its generators `points` (n, 3), for cells of the `sizes` (n,).
 
     In a run each cell is cut by planes of its own, and cells do not fit together. The mesh has the Voronoi cells of the
-    same generators, cut at the surface. With `warns` the function warns of defects of the mesh.
+    same generators, cut at the surface. With `warns` the function warns of defects of the mesh. With `spread` those in
+    thin parts do not stay halfway between the walls.
     """
     tell = engine.pool.on_work or (lambda _: None)
     tell("diagram of all cells")
     surface = WallSurface(domain, SurfaceSearch(engine, domain, domain.wall_triangles).nearest)
-    points = off_middle(surface, points, sizes)
+    if spread:
+        points = off_middle(surface, points, sizes)
     reach = _MARGIN * sizes.max()
     box = Box(tuple(np.subtract(domain.lower, reach).tolist()), tuple(np.add(domain.upper, reach).tolist()))
 

@@ -1,0 +1,138 @@
+"""Move generators of rejected cells, and those beside them, a little, so that the mesh can be made again."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TypeVar
+
+import numpy as np
+import scipy
+
+from ..geometry.domain import Domain
+from ..geometry.solid.creases import connect
+from ..geometry.surfaces.sheets import Sheets
+
+T = TypeVar("T")
+FEW = 0.03
+"""Largest share of generators that are moved, or that may have no cell."""
+_MOVES = 4
+"""How often generators of rejected cells are moved, at most."""
+_MOVE, _BESIDE = 0.15, 1.3
+"""How far they are moved, over h. Generators nearer to them than the second number, over h, are moved as well."""
+_DEEP = 0.1
+"""Least depth of moved generators in the domain, over h."""
+_NEAR, _MIRRORED = 0.75, 0.2
+"""Generators nearer to a patch inside than the first number, over h, may be one of a pair. Its mirror image in the
+patch is nearer to the other one than the second number, over h."""
+_SLANTED = 0.2
+"""Normals of patches span a further direction if their singular value is more than this share of the largest."""
+_FREE = 0.9
+"""Moved generators that are no pair do not come nearer to patches inside than this, over h."""
+
+
+def fewest_rejected(
+    first: T, rejected: Callable[[T], np.ndarray], again: Callable[[T, np.ndarray, int], T | None], n: int
+) -> T:
+    """Return the mesh of the fewest rejected cells: the `first`, or one of those made again.
+
+    Parameters
+    ----------
+    first : object
+        The mesh of `n` generators.
+    rejected : callable
+        Returns the generators of the rejected cells of a mesh, (k,) int; -1 for none.
+    again : callable
+        Makes the mesh again; called with the best mesh, the generators of its rejected cells, each once, and the number
+        of the attempt. None ends the attempts.
+    """
+    best = first
+    for move in range(_MOVES):
+        bad = rejected(best)
+        rows = np.setdiff1d(bad, [-1])
+        if not 0 < len(rows) <= FEW * n or (made := again(best, rows, move)) is None:
+            break
+        if len(rejected(made)) < len(bad):
+            best = made
+    return best
+
+
+def moved(
+    domain: Domain,
+    depth: Callable[[np.ndarray], np.ndarray],
+    points: np.ndarray,
+    sizes: np.ndarray,
+    rows: np.ndarray,
+    move: int,
+) -> np.ndarray:
+    """Return all generators (n, 3). Those of `rows` (k,) int and near these are moved, but stay in the domain.
+
+    The two generators of a pair, on both sides of a surface inside, are moved together along the surface.
+
+    Parameters
+    ----------
+    depth : callable
+        Returns how deep points (k, 3) are in the domain, (k,).
+    sizes : (n,) float
+        h at the generators.
+    move : int
+        The number of the attempt. It gives the directions.
+    """
+    beside = scipy.spatial.KDTree(points).query_ball_point(points[rows], _BESIDE * sizes[rows])
+    rows, points = np.unique(np.concatenate(beside).astype(np.int64)), points.copy()
+    away = np.random.default_rng(move).normal(size=(len(rows), 3))
+    away *= (_MOVE * sizes[rows] / np.linalg.norm(away, axis=1))[:, None]
+    sheets = None if domain.borders is None else domain.borders.sheets
+    group, least = np.arange(len(rows)), _DEEP * sizes[rows]
+    room = np.zeros(len(rows))
+    if sheets is not None:
+        rows, away, group = _along(sheets, points, sizes, rows, away)
+        least = _DEEP * sizes[rows]
+        room = np.minimum(sheets.distance(points[rows]), _FREE * sizes[rows])
+        room[np.bincount(group)[group] > 1] = 0
+    for sign in (1, -1):
+        x = points[rows] + sign * away
+        good = depth(x) > least
+        if sheets is not None:
+            good &= sheets.distance(x) >= room
+        whole = np.ones(int(group.max(initial=-1)) + 1, bool)
+        whole[group[~good]] = False
+        inside = whole[group]
+        points[rows[inside]] = x[inside]
+        rows, away, group, least = rows[~inside], away[~inside], group[~inside], least[~inside]
+        room = room[~inside]
+    return points
+
+
+def _along(
+    sheets: Sheets, points: np.ndarray, sizes: np.ndarray, rows: np.ndarray, away: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return which generators move, how far, and with which others: `rows` (k,), the other ones of pairs after them.
+
+    Generators that move together have one number. They move as the first of them would, along all patches between them.
+    """
+    tree, given, new = scipy.spatial.KDTree(points), len(rows), rows
+    pairs, normals = [np.zeros((0, 2), np.int64)], [np.zeros((0, 3))]
+    while len(new):
+        h = sizes[new]
+        for patch in sheets.patches:
+            feet = patch.feet(points[new], _NEAR * float(h.max()))
+            near = np.flatnonzero((feet.triangle >= 0) & (feet.distance < _NEAR * h))
+            gap, other = tree.query(2 * feet.point[near] - points[new[near]])
+            paired = gap < _MIRRORED * h[near]
+            pairs.append(np.column_stack([new[near[paired]], other[paired]]))
+            normals.append((points[new[near]] - feet.point[near])[paired])
+        new = np.setdiff1d(np.concatenate(pairs)[:, 1], rows)
+        rows = np.concatenate([rows, new])
+    mates, across = np.concatenate(pairs), np.concatenate(normals)
+    across /= np.linalg.norm(across, axis=1)[:, None]
+    place = np.full(len(points), -1)
+    place[rows] = np.arange(len(rows))
+    group = connect(len(rows), place[mates])[1]
+    first = np.unique(group, return_index=True)[1]
+    away = np.concatenate([away, np.zeros((len(rows) - given, 3))])[first]
+    of_pair = group[place[mates[:, 0]]]
+    for g in np.unique(of_pair).tolist():
+        directions, share = np.linalg.svd(across[of_pair == g])[1:][::-1]
+        fixed = directions[: int((share > _SLANTED * share[0]).sum())]
+        away[g] -= fixed.T @ (fixed @ away[g])
+    return rows, away[group], group

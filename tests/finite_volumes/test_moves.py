@@ -1,0 +1,61 @@
+"""Generators of rejected cells: how they are moved, alone and as pairs beside surfaces, and which mesh is kept."""
+
+import numpy as np
+import pytest
+
+import clvoro
+from clvoro.finite_volumes.moves import fewest_rejected, moved
+
+H = 0.25
+CUBE = clvoro.Solid.box((0, 0, 0), (1, 1, 1))
+
+
+def in_solid(solid, x, rows, move):
+    return moved(solid, lambda at: -solid.signed_distance(at), x, np.full(len(x), H), np.array(rows), move)
+
+
+def test_generators_of_rejected_cells_are_moved_inside_of_the_solid():
+    """So are those beside them. One in a corner is moved away from it; where there is no room, it stays."""
+    row = 0.5 + np.array([[0, 0, 0], [1.2 * H, 0, 0], [1.4 * H, 0, 0]])
+    assert (in_solid(CUBE, row, [0], 0) != row).any(axis=1).tolist() == [True, True, False]
+    solid = clvoro.Solid.box((0, 0, 0), (1, 1, 0.25 * H))
+    x = np.array([[0.5, 0.5, 0.12 * H], [0.5, 0.2, 0.13 * H], [0.12 * H, 0.12 * H, 0.12 * H], [0.3, 0.3, 0.05 * H]])
+    for move in range(3):
+        there = in_solid(solid, x, [0, 2, 3], move)
+        away = np.linalg.norm(there - x, axis=1) / H
+        assert away[1] == 0
+        assert all(a == 0 or a == pytest.approx(0.15) for a in away)
+        assert (solid.signed_distance(there[away > 0]) < 0).all()
+
+
+def test_pairs_stay_mirror_images_in_all_patches_between_them():
+    """Of a generator near a cross of two planes all four move, along the line in which the planes meet."""
+    line = np.array([(0.5, 0.5, -1), (0.5, 0.5, 2)])
+    halves = [np.concatenate([line, line[::-1] + way]) for way in np.eye(3)[[0, 0, 1, 1]] * [[1], [-1], [1], [-1]]]
+    surfaces = [(half, np.array([(0, 1, 2), (0, 2, 3)])) for half in halves]
+    domain = clvoro.Box((0, 0, 0), (1, 1, 1)).with_surfaces(surfaces)
+    cross = [(0.5 + s * H / 2, 0.5 + t * H / 2, 0.5) for s in (1, -1) for t in (1, -1)]
+    pair = [(0.2, 0.5 + s * H / 2, 0.5) for s in (1, -1)]
+    x = np.array([*cross, *pair, (0.2, 0.5 + 1.1 * H, 0.5)])
+    depth = domain.boundary_distance
+    for move in range(4):
+        away = moved(domain, depth, x, np.full(len(x), H), np.array([0, 4]), move) - x
+        assert away[:4] == pytest.approx(np.tile(away[0] * (0, 0, 1), (4, 1)), abs=1e-12)
+        assert away[4:6] == pytest.approx(np.tile(away[4] * (1, 0, 1), (2, 1)), abs=1e-12)
+        assert abs(away[0, 2]) > 0
+        assert np.linalg.norm(away[4]) > 0
+        assert domain.borders.sheets.distance(x[6:] + away[6:])[0] >= 0.9 * H - 1e-12
+
+
+def test_the_mesh_of_the_fewest_rejected_cells_is_kept():
+    """Each attempt begins at the best mesh so far; too many rejected cells end the attempts, as does None."""
+    begun = []
+
+    def again(best, rows, move):
+        begun.append((best, rows.tolist(), move))
+        return [[1, 2, 5], [3], [4, -1], None][move]
+
+    assert fewest_rejected([1, 2, 2], np.array, again, 1000) == [3]
+    assert begun == [([1, 2, 2], [1, 2], 0), ([1, 2, 2], [1, 2], 1), ([3], [3], 2), ([3], [3], 3)]
+    assert fewest_rejected([1, 2, 2], np.array, again, 10) == [1, 2, 2]
+    assert fewest_rejected([], np.array, again, 1000) == []
