@@ -1013,7 +1013,7 @@ TESTED_IN = {
     "; use fewer layers": "finite_volumes/test_prism_layers.py::test_wrong_layers_are_refused",
     "expected a communicator of mpi4py": "adaptation/test_ranks.py::test_what_ranks_cannot_share_is_refused",
     "since ranks or devices share the run": "adaptation/test_ranks.py::test_what_ranks_cannot_share_is_refused",
-    "as CLVORO_MEMORY_LIMIT says": "adaptation/test_ranks.py::test_parts_hold_what_one_device_does_not",
+    "says; allow more, or use a larger size": "adaptation/test_ranks.py::test_parts_hold_what_one_device_does_not",
     "unset it for no limit": "adaptation/test_ranks.py::test_parts_hold_what_one_device_does_not",
     "expected a list of names, indices": "adaptation/test_ranks.py::test_devices_share_a_run",
     "expected one of them; leave one out": "adaptation/test_ranks.py::test_devices_share_a_run",
