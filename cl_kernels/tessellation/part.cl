@@ -11,15 +11,6 @@ kernel void name_owners(const int size, const int n, global const int *owners, g
     }
 }
 
-/* marks[g] = 1 for ghosts g that are neighbors of one of the first `size` generators. One work-item per generator. */
-kernel void mark_ghosts(const int size, global const int *starts, global const int *neighbors, global int *marks)
-{
-    WORK_ITEM(i);
-    for (int k = starts[i]; k < starts[i + 1]; ++k)
-        if (neighbors[k] >= size)
-            marks[neighbors[k]] = 1;
-}
-
 /* A number from 1 to 2 for the face between the generators with labels a and b, whichever comes first. */
 inline REAL weight_of_face(int a, int b)
 {
@@ -28,36 +19,50 @@ inline REAL weight_of_face(int a, int b)
     return 1 + (REAL)(h >> 16) / 65536;
 }
 
-/* Whether this part knows all generators in the ball around generator i with the radius needed * reach[i], and whether
-   generator i is outside of the balls of all parts that do not know it. When the generator was at at[i], this part knew
-   all generators within limits[i].s0 of it, and it was at least limits[i].s1 away from those balls of other parts. */
-inline bool is_within_limits(int i, REAL needed, global const float *reach, global const REAL *points,
-                             global const REAL *at, global const float2 *limits)
+/* Radius of the ball around generator i in which its part must know all generators. The radius is `factor` times the
+   reach of the cell. If the cells of ghosts must be final, too (`with_ghosts`), the ball also contains the balls of the
+   ghosts beside the cell. */
+inline REAL needed_radius(int i, int n, int with_ghosts, REAL factor, global const int *starts,
+                          global const int *neighbors, global const float *reach, global const REAL *points)
 {
-    REAL moved2 = 0;
-    for (int a = 0; a < DIM; ++a) {
-        const REAL d = points[DIM * i + a] - at[DIM * i + a];
-        moved2 += d * d;
+    REAL radius = factor * reach[i];
+    for (int k = with_ghosts ? starts[i] : starts[i + 1]; k < starts[i + 1]; ++k) {
+        const int j = neighbors[k];
+        if (j < n)
+            continue;
+        REAL way2 = 0;
+        for (int a = 0; a < DIM; ++a) {
+            const REAL d = points[DIM * j + a] - points[DIM * i + a];
+            way2 += d * d;
+        }
+        radius = fmax(radius, sqrt(way2) + factor * reach[j]);
     }
-    const REAL moved = sqrt(moved2);
-    return needed * reach[i] + moved <= limits[i].s0 && moved <= limits[i].s1;
+    return radius;
 }
 
 /* sums[4 t ...] = the volumes of the generators t, t + size, ... of n; the weighted measures of their faces with
-   ghosts, positive in the cell of the lower label; those without signs; and how many of the first `rows` generators and
-   marked ghosts, again t, t + size, ..., are beyond their limits. Over all parts the second sum is zero if each face
-   has both sides. One work-item per t. */
+   ghosts, positive in the cell of the lower label; those without signs; and how many of these generators are beyond
+   their limits. Over all parts the second sum is zero if each face has both sides. One work-item per t.
+
+   needed[i] is the radius above. When generator i was at at[i], its part knew all generators within limits[i].s0 of it,
+   and it was at least limits[i].s1 away from the balls of other parts that do not know it. */
 kernel void sum_cells(const int size, const int n, global const int *starts, global const int *neighbors,
                       global const int *labels, global const FACE *face_measures, global const REAL *volumes,
-                      global const int *marks, const int rows, global const float *reach, global const REAL *points,
-                      global const REAL *at, global const float2 *limits, const REAL needed, global REAL *sums)
+                      const int with_ghosts, const REAL factor, global const float *reach, global const REAL *points,
+                      global const REAL *at, global const float2 *limits, global float *needed, global REAL *sums)
 {
     WORK_ITEM(t);
     REAL volume = 0, signed_sum = 0, sum = 0, beyond = 0;
-    for (int i = t; i < rows; i += size) {
-        beyond += (i < n || marks[i]) && !is_within_limits(i, needed, reach, points, at, limits);
-        if (i >= n)
-            continue;
+    for (int i = t; i < n; i += size) {
+        REAL moved2 = 0;
+        for (int a = 0; a < DIM; ++a) {
+            const REAL d = points[DIM * i + a] - at[DIM * i + a];
+            moved2 += d * d;
+        }
+        const REAL moved = sqrt(moved2);
+        const REAL radius = needed_radius(i, n, with_ghosts, factor, starts, neighbors, reach, points);
+        needed[i] = (float)(radius * (1 + R(1e-6)));
+        beyond += !(radius + moved <= limits[i].s0 && moved <= limits[i].s1);
         volume += volumes[i];
         for (int k = starts[i]; k < starts[i + 1]; ++k) {
             const int j = neighbors[k];

@@ -186,48 +186,40 @@ class Part:
         self.order_rows(engine, t, {**defines, "FACE": engine.name_of(engine.real)})
         return t
 
-    def mark_neighbors(self, engine: Engine, t: Tessellation, marks: cla.Array) -> None:
-        """Set `marks` (count,) int32 to 1 for ghosts that are neighbors of own generators in `t`, else to 0."""
-        kernel = engine.kernels("tessellation/part", shared=True).mark_ghosts
-        engine.run_each(kernel, self.n_own, t.starts, t.neighbors, marks.fill(0))
-
     def sums(
         self,
         engine: Engine,
         t: Tessellation,
-        marks: cla.Array,
-        rows: int,
-        reach: cla.Array,
         at: cla.Array,
         limits: cla.Array,
-        needed: float,
+        factor: float,
+        with_ghosts: bool,
+        needed: cla.Array,
     ) -> np.ndarray:
         """Return sums over own cells that prove, with those of all parts, that `t` is a part of the whole diagram.
 
         Parameters
         ----------
-        marks : (count,) int32
-            1 for ghosts whose cells must be final.
-        rows : int
-            Of the first `rows` generators and ghosts the cells must be final, of ghosts only where `marks` is 1.
-        reach : (rows,) float32
-            See `Tessellation`.
-        at, limits : (count, d) real, (count, 2) float32
-            Of each generator and ghost an earlier position, the radius around it within which all generators are known,
-            and how far the generator may move from it.
-        needed : float
-            Radius of the ball in which all generators must be known, over the reach.
+        at, limits : (n_own, d) real, (n_own, 2) float32
+            Of each generator an earlier position, the radius around it within which all generators are known, and how
+            far the generator may move from it.
+        factor : float
+            Radius of the ball in which all generators must be known, over the reach of a cell.
+        with_ghosts : bool
+            Whether the cells of ghosts beside own cells must be final, too.
+        needed : (n_own,) float32
+            Receives the radii of the balls around own generators in which all generators must be known.
 
         Returns
         -------
         (4,) ndarray
             The volume of own cells; the signed sum of the measures of their faces with ghosts; the sum without signs;
-            the number of generators and ghosts beyond their limits. The signed sums of all parts add up to zero if each
-            face between two parts has both sides.
+            the number of generators beyond their limits. The signed sums of all parts add up to zero if each face
+            between two parts has both sides.
         """
         sums = engine.scratch((SUMS, 4))
         given = t.starts, t.neighbors, self.labels, t.face_measures, t.volumes
-        limited = marks, np.int32(rows), reach, self.points, at, limits, engine.real.type(needed)
+        limited = np.int32(with_ghosts), engine.real.type(factor), t.reach, self.points, at, limits, needed
         kernel = engine.kernels("tessellation/part", shared=True).sum_cells
         engine.run_each(kernel, SUMS, np.int32(self.n_own), *given, *limited, sums)
         return sums.get().sum(axis=0, dtype=float)

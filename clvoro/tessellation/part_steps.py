@@ -33,14 +33,14 @@ from .polyhedra import Polyhedra
 from .stages import TessellationStages
 from .steps import DomainSteps, Sort
 
-FIRST_REACH = 1.9, 2.4
+FIRST_REACH = 2.4, 3.3
 """Radius of the first balls over the spacing of the generators around. The first number holds where only own cells must
 be final (3D), the second where the cells of neighboring ghosts must be final, too (2D)."""
 ROUGH = 12
 """Bits of a coordinate in the Hilbert keys that order the generators of a part."""
 JUMP = 8
 """A new chunk begins where two successive generators on the curve are more than so many spacings apart."""
-GROWTH, SKIN = 1.15, 0.15
+GROWTH, SKIN = 1.2, 0.15
 """Radius of the balls of a part, over that of the balls that its cells need. Width of the skin around each ball, as a
 share of this radius: a part asks for the generators in the skin, too, because they may move into the ball."""
 NEAR, FREE = 1.6, 0.8
@@ -55,7 +55,7 @@ MOST_GHOSTS = 0.5
 """In 3D cells are built anew, and not updated, if there are more ghosts than this share of the own generators: too many
 cells are beside ghosts."""
 GROUP = 64
-"""Number of balls in a group, if they are around ghosts or another part has sent them."""
+"""Number of balls in a group, if another part has sent them."""
 FAILED = np.array([0.0, 0.0, 0.0, 0.0, 1.0])
 """Sums of a part whose update has failed: nothing to those of `Part.sums`, and one to the number of such parts."""
 
@@ -102,42 +102,37 @@ class BallGroups:
 
     Parameters
     ----------
-    centers : (m, d) float
-    radii : (m,) float
-    order : (m,) int
-        Numbers of the balls, group by group.
-    firsts : (k,) int
-        Where groups begin in `order`.
-    own : int
-        Number of groups around generators of the part. They come first; the others are around ghosts.
+    centers : (n, d) float
+    radii : (n,) float
+    chunks : Chunks
+        The centers in groups.
 
     Attributes
     ----------
     centers, radii : arrays
         Those of the balls, group by group.
+    ends : (k + 1,) int
+        Where groups end, after a zero.
     boxes : (k, 2 d) float
         Lower and upper corners of boxes around the centers of each group.
-    facts : (k, 2 d + 3) float
-        What other parts have to know: the boxes, the largest radius, the smallest skin, and whether the box is around
-        generators of the part.
+    facts : (k, 2 d + 2) float
+        What other parts have to know: the boxes, the largest radius and the smallest skin.
     """
 
-    def __init__(self, centers: np.ndarray, radii: np.ndarray, order: np.ndarray, firsts: np.ndarray, own: int) -> None:
-        self.centers, self.radii, self.order = centers[order], radii[order], order
-        self.ends = np.append(firsts, len(order))
+    def __init__(self, centers: np.ndarray, radii: np.ndarray, chunks: Chunks) -> None:
+        firsts = chunks.firsts
+        self.centers, self.radii = centers[chunks.order], radii[chunks.order]
+        self.ends = np.append(firsts, len(chunks.order))
         lower, upper = (f.reduceat(self.centers, firsts, axis=0) for f in (np.minimum, np.maximum))
         self.largest = np.maximum.reduceat(self.radii, firsts)
-        skins = SKIN * np.minimum.reduceat(self.radii, firsts)
         self.boxes = np.hstack([lower, upper])
-        self.facts = np.column_stack([self.boxes, self.largest, skins, np.arange(len(firsts)) < own])
+        self.facts = np.column_stack([self.boxes, self.largest, SKIN * np.minimum.reduceat(self.radii, firsts)])
 
     def facing(self, facts: np.ndarray) -> Facing:
-        """Return how far these balls are from the boxes of another part, which has sent its `facts` (k, 2 d + 3)."""
-        boxes, largest = facts[:, :-3], facts[:, -3]
+        """Return how far these balls are from the boxes of another part, which has sent its `facts` (k, 2 d + 2)."""
+        boxes, largest = facts[:, :-2], facts[:, -2]
         away = gaps(self.boxes, around(boxes))[:, 0]
-        reach = np.where(
-            self.facts[:, -1] > 0, NEAR * np.maximum(self.largest, largest.max()), (1 + SKIN) * self.largest
-        )
+        reach = NEAR * np.maximum(self.largest, largest.max())
         near = np.flatnonzero(away <= reach)
         groups, others = np.nonzero(gaps(self.boxes[near], boxes) <= reach[near, None])
         groups = near[groups]
@@ -154,8 +149,7 @@ class BallGroups:
 
     def meeting(self, facing: Facing) -> np.ndarray:
         """Return which balls, with their skins, meet a box in which the other part has generators, (m,) int."""
-        holds = facing.facts[facing.others, -1] > 0
-        return np.unique(facing.places[holds & (facing.ways <= (1 + SKIN) * self.radii[facing.places])])
+        return np.unique(facing.places[facing.ways <= (1 + SKIN) * self.radii[facing.places]])
 
 
 @dataclass(frozen=True)
@@ -164,7 +158,7 @@ class Facing:
 
     Attributes
     ----------
-    facts : (m, 2 d + 3) float
+    facts : (m, 2 d + 2) float
         Facts about the groups of the other part; see `BallGroups`.
     away : (k,) float
         Lower bound of the distance of each group from the boxes with which its balls have no pairs.
@@ -302,36 +296,29 @@ class PartSteps(DomainSteps):
         self._corners = [corner[: engine.dim].astype(float) for corner in self.box.device_corners(engine.real)]
         self._labels, self._chunks = labels, Chunks(x, *self._corners)
         self._sent = [np.empty(0, np.int32) for _ in range(count)]
-        self._parts, self._rows, self._ghost_order = np.empty(0, int), np.empty(0, np.int32), np.empty(0, int)
+        self._parts, self._rows = np.empty(0, int), np.empty(0, np.int32)
         self._caps = FIRST_REACH[self._reads_rows] * self._chunks.spacings
-        none = np.empty(0, int)
-        answers = self._ask(x, none, self._caps, self._caps)
+        answers = self._ask(x, self._caps, self._caps)
         self._take(answers)
-        self._limit(answers, len(x), none)
+        self._limit(answers)
         self._store()
 
     def _store(self) -> None:
-        """Upload the lists of ghosts, and get from their owners their labels and the radii of their balls."""
+        """Upload the lists of ghosts, and get their labels from their owners."""
         engine, n = self.stages.engine, len(self._chunks.order)
         order = np.argsort(self._parts, kind="stable")
         self._parts, self._rows = self._parts[order], self._rows[order]
         self._ghosts = Ghosts.of_lists(engine, self.peers, self._parts, self._rows, self._sent)
-        self._ghost_order = np.empty(0, int)
         assert self._labels is not None
-        labels, caps = self._labels.get()[:n], self._caps[:n]
-        known = [np.column_stack([labels[rows], caps[rows]]) for rows in self._sent]
-        found = np.concatenate(self.peers.exchange(known))
-        self._all_labels = engine.upload(np.concatenate([labels, found[:, 0].astype(np.int32)]), np.int32)
-        self._caps = np.concatenate([caps, found[:, 1]])
-        # Cells next to new ghosts may need more.
-        self._limits = np.pad(self._limits[:n], ((0, len(self._rows)), (0, 0)))
-        self._limits[n:, 1] = np.inf
+        labels = self._labels.get()[:n]
+        found = self.peers.exchange([labels[rows] for rows in self._sent])
+        self._all_labels = engine.upload(np.concatenate([labels, *found]), np.int32)
 
     def _note(self, points: cla.Array) -> None:
-        """Keep the positions for which the limits hold, `points` (count, d), and upload the limits."""
-        engine = self.stages.engine
-        self._at = self._room("at", size=points.size).reshape(points.shape)
-        cl.enqueue_copy(engine.queue, buffer_of(self._at), buffer_of(points), byte_count=points.nbytes)
+        """Keep the positions of own generators, for which the limits hold, and upload the limits."""
+        engine, n = self.stages.engine, len(self._chunks.order)
+        self._at = self._room("at", size=n * engine.dim).reshape(n, engine.dim)
+        cl.enqueue_copy(engine.queue, buffer_of(self._at), buffer_of(points), byte_count=self._at.nbytes)
         # Rounded towards smaller ones.
         self._limits_there = engine.upload(self._limits * (1 - 1e-6), np.float32)
 
@@ -379,19 +366,15 @@ class PartSteps(DomainSteps):
         engine, n, sums = self.stages.engine, part.n_own, FAILED
         if part.ghosts is None:
             return None if t is None else replace(t, part=part)
-        marks = engine.scratch(part.count, np.int32)
+        needed = engine.scratch(n, np.float32)
         if t is not None:
-            assert t.reach is not None
             assert self._at is not None
-            if self._reads_rows:
-                part.mark_neighbors(engine, t, marks)
-            rows = part.count if self._reads_rows else n
-            given = t.reach, self._at, self._limits_there, 2 * (1 + NOISE[engine.real.name])
-            sums = np.append(part.sums(engine, t, marks, rows, *given), 0)
+            given = self._at, self._limits_there, 2 * (1 + NOISE[engine.real.name]), self._reads_rows, needed
+            sums = np.append(part.sums(engine, t, *given), 0)
         sums = self.peers.total(sums)
         if sums[-1] or t is None:
             return None
-        if sums[3] and not self._ask_again(part, t, marks):
+        if sums[3] and not self._ask_again(part, needed.get().astype(float)):
             return None
         self._check(*sums[:3])
         whole = t if t.n == part.count else None
@@ -408,54 +391,39 @@ class PartSteps(DomainSteps):
                 f"{abs(gap) / max(faces, 1e-300):.2g} of their area, expected none: ghosts are missing"
             )
 
-    def _ask_again(self, part: Part, t: Tessellation, marks: cla.Array) -> bool:
-        """Ask for the ghosts that the cells of `t` need. Return False if there are new ones."""
-        n, x = part.n_own, part.points.get().astype(float)
-        ghosts = np.empty(0, int)
-        if self._reads_rows:
-            ghosts = n + np.flatnonzero(marks.get()[n:])
-        rows = np.concatenate([np.arange(n), ghosts])
-        assert t.reach is not None
-        needed = t.reach.get()[rows].astype(float) * (2 * (1 + NOISE[self.stages.engine.real.name]))
+    def _ask_again(self, part: Part, needed: np.ndarray) -> bool:
+        """Ask for the ghosts in balls of radii `needed` (n,). Return False if there are new ones."""
+        x = part.points[: part.n_own].get().astype(float)
         while True:
             # A cell without the ghosts around it may reach through the whole domain.
-            radii = np.minimum(GROWTH * needed, 2 * self._caps[rows])
-            answers = self._ask(x, ghosts, radii, np.minimum(needed, radii))
-            self._caps[rows] = np.maximum(self._caps[rows], radii)
+            radii = np.maximum(self._caps, np.minimum(GROWTH * needed, 2 * self._caps))
+            answers = self._ask(x, radii, np.minimum(needed, radii))
+            self._caps = radii
             new, short = self.peers.total(np.array([answers.needed, (needed > radii).any()]))
             if new:
                 self._take(answers)
-            else:
-                answers.shrink()
-            self._limit(answers, len(x), ghosts)
-            if new:
+                self._limit(answers)
                 self._store()
                 return False
+            answers.shrink()
+            self._limit(answers)
             if not short:
                 self._note(part.points)
                 return True
 
-    def _ask(self, x: np.ndarray, ghosts: np.ndarray, radii: np.ndarray, needed: np.ndarray) -> Answers:
-        """Ask for the generators in balls around own generators and `ghosts`.
+    def _ask(self, x: np.ndarray, radii: np.ndarray, needed: np.ndarray) -> Answers:
+        """Ask for the generators in balls around own generators.
 
         Parameters
         ----------
-        x : (n or more, d) float
-            Positions of the generators, and of ghosts.
-        ghosts : (k,) int
-            Rows of the ghosts in `x`.
-        radii, needed : (n + k,) float
+        x : (n, d) float
+            Positions of the generators.
+        radii, needed : (n,) float
             Radii of the balls to ask for, and of the balls that the present cells need.
         """
         self.asked += 1
-        own, n = self._chunks, len(self._chunks.order)
-        if len(self._ghost_order) != len(x) - n:
-            self._ghost_order = np.argsort(np.argsort(hilbert_keys(x[n:], *self._corners, ROUGH), kind="stable"))
-        order = np.concatenate([own.order, n + np.argsort(self._ghost_order[ghosts - n])])
-        firsts = np.concatenate([own.firsts, np.arange(n, len(radii), GROUP)])
-        centers = np.concatenate([x[:n], x[ghosts]])
-        balls = BallGroups(centers, radii, order, firsts, len(own.firsts))
-        told, peers = self.peers.exchange([balls.facts] * self.peers.count), self.peers
+        order, peers, balls = self._chunks.order, self.peers, BallGroups(x, radii, self._chunks)
+        told = peers.exchange([balls.facts] * peers.count)
         facing = {number: balls.facing(told[number]) for number in range(peers.count) if number != peers.number}
         none = np.empty(0, int)
         asked = [balls.meeting(facing[number]) if number in facing else none for number in range(peers.count)]
@@ -476,15 +444,10 @@ class PartSteps(DomainSteps):
         rows = np.concatenate([rows[:, 0] for rows in answers.new]).astype(np.int32)
         self._parts, self._rows = np.concatenate([self._parts, numbers]), np.concatenate([self._rows, rows])
 
-    def _limit(self, answers: Answers, count: int, ghosts: np.ndarray) -> None:
-        """Set the limits of `count` generators and ghosts. Of the ghosts only the rows `ghosts` (k,) have balls."""
-        n, order = len(self._chunks.order), self._chunks.order
-        self._limits = np.full((count, 2), np.inf)
-        self._limits[n:, 0] = 0
-        radii = np.empty(n + len(ghosts))
-        radii[answers.balls.order] = answers.balls.radii
-        self._limits[ghosts, 0] = radii[n:]
-        self._limits[order] = np.column_stack(self._limits_of(answers.balls, answers.facing))
+    def _limit(self, answers: Answers) -> None:
+        """Set the limits of own generators."""
+        self._limits = np.empty((len(self._chunks.order), 2))
+        self._limits[self._chunks.order] = np.column_stack(self._limits_of(answers.balls, answers.facing))
         self._at = None
 
     def _unknown(self, own: BallGroups, balls: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -499,33 +462,32 @@ class PartSteps(DomainSteps):
         firsts = np.arange(0, len(balls), GROUP)
         lower = np.minimum.reduceat(balls[:, :dim] - balls[:, dim:], firsts, axis=0)
         groups = np.hstack([lower, np.maximum.reduceat(balls[:, :dim] + balls[:, dim:], firsts, axis=0)])
-        near = (gaps(own.boxes[: len(chunks.firsts)], groups) <= 0).any(axis=1)
-        places = np.flatnonzero(np.repeat(near, np.diff(np.append(chunks.firsts, len(chunks.order)))))
+        near = (gaps(own.boxes, groups) <= 0).any(axis=1)
+        places = np.flatnonzero(np.repeat(near, np.diff(own.ends)))
         places = places[~np.isin(chunks.order[places], known)]
         places = places[inside(own.centers[places], balls)]
         return chunks.order[places].astype(np.int32), own.centers[places]
 
     def _limits_of(self, balls: BallGroups, facing: dict[int, Facing]) -> tuple[np.ndarray, np.ndarray]:
-        """Return the limits of own generators along the curve, (n,) each; see `is_within_limits` in part.cl.
+        """Return the limits of own generators along the curve, (n,) each; see `sum_cells` in part.cl.
 
         A generator that another part does not know is at least a skin away from each ball of that part. Far from all
         other parts, the radius of a ball is a share of the distance to them.
         """
-        chunks = self._chunks
-        n, k = len(chunks.order), len(chunks.firsts)
-        sizes = np.diff(balls.ends)[:k]
+        n, sizes = len(self._chunks.order), np.diff(balls.ends)
         free, room = np.full(n, np.inf), np.full(n, np.inf)
         for number, f in facing.items():
-            largest, skins, holds = f.facts[:, -3], f.facts[:, -2], f.facts[:, -1] > 0
-            away = f.away[:k]
+            largest, skins = f.facts[:, -2], f.facts[:, -1]
             ways, rooms = (
                 np.repeat(values, sizes)
-                for values in (away, np.maximum(skins.min(), away - np.maximum(largest.max(), FREE * away)))
+                for values in (f.away, np.maximum(skins.min(), f.away - np.maximum(largest.max(), FREE * f.away)))
             )
-            own = f.places < n
-            places, to, gap = f.places[own], f.others[own], f.ways[own]
-            np.minimum.at(ways, places[holds[to]], gap[holds[to]])
-            np.minimum.at(rooms, places, np.maximum(skins[to], gap - np.maximum(largest[to], FREE * gap)))
-            rooms[np.isin(chunks.order, self._sent[number])] = np.inf
+            np.minimum.at(ways, f.places, f.ways)
+            np.minimum.at(
+                rooms, f.places, np.maximum(skins[f.others], f.ways - np.maximum(largest[f.others], FREE * f.ways))
+            )
+            known = np.zeros(n, bool)
+            known[self._sent[number]] = True
+            rooms[known[self._chunks.order]] = np.inf
             free, room = np.minimum(free, FREE * ways), np.minimum(room, rooms)
-        return np.maximum(balls.radii[:n], free), room
+        return np.maximum(balls.radii, free), room
