@@ -12,37 +12,24 @@ from ..tessellation.device_diagram import Tessellation
 
 @dataclass(frozen=True)
 class CellWeights:
-    """Cells against the size field, on the device.
-
-    Attributes
-    ----------
-    density : (n,) real
-        rho = h^-d.
-    weight : (n,) real
-        V rho, the number of generators that the cell should have.
-    log_ratio : (n,) real
-        r = log(V rho) = log(V / h^d) = d log(L / h).
-    """
+    """Cells against the size field, on the device."""
 
     density: cla.Array
+    """(n,) real. rho = h^-d."""
     weight: cla.Array
+    """(n,) real. V rho, the number of generators that the cell should have."""
     log_ratio: cla.Array
+    """(n,) real. r = log(V rho) = log(V / h^d) = d log(L / h)."""
 
 
 @dataclass(frozen=True)
 class LloydWeights(CellWeights):
-    """Weights of the cells, and weighted centroids, on the device.
-
-    Attributes
-    ----------
-    gradient : (n, d) real
-        grad log h, fitted to the neighbors' h.
-    lloyd : (n, d) real
-        Displacement to the centroid weighted by h^-(d + 2).
-    """
+    """Weights of the cells, and weighted centroids, on the device."""
 
     gradient: cla.Array
+    """(n, d) real. grad log h, fitted to the neighbors' h."""
     lloyd: cla.Array
+    """(n, d) real. Displacement to the centroid weighted by h^-(d + 2)."""
 
 
 class Density:

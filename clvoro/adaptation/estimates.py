@@ -66,24 +66,17 @@ SAMPLE = 4096
 
 @dataclass(frozen=True)
 class Extras:
-    """What a run of n cells needs besides its cells.
-
-    Attributes
-    ----------
-    images : float, optional
-        Ghost images per generator in periodic boxes (`expected_images`); by default those of equal cells.
-    surplus : float
-        Temporary additional cells, per cell (`expected_surplus`).
-    field_bytes : float
-        Memory of the size field.
-    boundary : float, optional
-        Cells at a boundary that cuts cells; by default those of equal cells.
-    """
+    """What a run of n cells needs besides its cells."""
 
     images: float | None = None
+    """float, optional. Ghost images per generator in periodic boxes (`expected_images`); by default those of equal
+    cells."""
     surplus: float = 0.0
+    """Temporary additional cells, per cell (`expected_surplus`)."""
     field_bytes: float = 0.0
+    """Memory of the size field."""
     boundary: float | None = None
+    """float, optional. Cells at a boundary that cuts cells; by default those of equal cells."""
 
 
 def estimate_memory(

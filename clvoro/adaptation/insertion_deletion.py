@@ -68,24 +68,16 @@ class CellSizes:
 
 @dataclass(frozen=True)
 class Change:
-    """The change of a set of generators.
-
-    Attributes
-    ----------
-    missing : float
-        Generators to insert, by the size field or a fixed number; negative: to delete.
-    nuclei : int
-        Pairs of dislocations to nucleate.
-    climb : bool
-        In 2D, let dislocations climb. Otherwise only the number is corrected, exactly.
-    climb_strain : float
-        Strain above which a dislocation climbs. Above `CLIMB_STRAIN`, dislocations at walls do not change.
-    """
+    """The change of a set of generators."""
 
     missing: float
+    """Generators to insert, by the size field or a fixed number; negative: to delete."""
     nuclei: int = 0
+    """Pairs of dislocations to nucleate."""
     climb: bool = True
+    """In 2D, let dislocations climb. Otherwise only the number is corrected, exactly."""
     climb_strain: float = CLIMB_STRAIN
+    """Strain above which a dislocation climbs. Above `CLIMB_STRAIN`, dislocations at walls do not change."""
 
 
 class InsertionDeletion:

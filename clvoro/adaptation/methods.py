@@ -43,22 +43,15 @@ from .tuning import (
 
 @dataclass(frozen=True)
 class Relaxation:
-    """Relaxation of the paper's (3.4) and (3.5).
-
-    Attributes
-    ----------
-    alpha : float or None
-        Largest relaxation coefficient. None means d, which cancels a small error in one step (a relative error e of
-        lengths is a relative error d e of volumes).
-    k : float
-        Largest displacement over h.
-    tolerance : float
-        Relative residual of the Poisson solve.
-    """
+    """Relaxation of the paper's (3.4) and (3.5)."""
 
     alpha: float | None = None
+    """float or None. Largest relaxation coefficient. None means d, which cancels a small error in one step (a relative
+    error e of lengths is a relative error d e of volumes)."""
     k: float = 0.5
+    """Largest displacement over h."""
     tolerance: float = 1e-4
+    """Relative residual of the Poisson solve."""
 
 
 @dataclass(frozen=True)

@@ -58,79 +58,51 @@ _APART = 0.7
 
 @dataclass(frozen=True)
 class Prepared:
-    """What a run needs before it begins.
-
-    Attributes
-    ----------
-    options : Options
-    setup : Setup
-    points : (n, d) ndarray or None
-        Generators of the caller.
-    rows : (m, d) ndarray
-        Generators of layers, which do not move.
-    tree : DensityTree or None
-        Where the cells are; None if the generators of the caller keep their number.
-    required : float
-        Cells that the size field requires, or that the caller gives.
-    target : int
-        Cells of the finest level.
-    lattice : (n, d) ndarray or None
-        Generators at the start of a moving mesh.
-    levels : int
-        Number of coarser levels.
-    kept_rows : (n,) int or None
-        Indices of `points` among those that the caller has given, if points in layers of a solid are left out.
-    memory : float
-        Estimated device memory of the run, or of reading its diagram, in bytes.
-    """
+    """What a run needs before it begins."""
 
     options: Options
     setup: Setup
     points: np.ndarray | None
+    """(n, d) ndarray or None. Generators of the caller."""
     rows: np.ndarray
+    """(m, d) ndarray. Generators of layers, which do not move."""
     tree: DensityTree | None
+    """Where the cells are; None if the generators of the caller keep their number."""
     required: float
+    """Cells that the size field requires, or that the caller gives."""
     target: int
+    """Cells of the finest level."""
     lattice: np.ndarray | None
+    """(n, d) ndarray or None. Generators at the start of a moving mesh."""
     levels: int
+    """Number of coarser levels."""
     kept_rows: np.ndarray | None
+    """(n,) int or None. Indices of `points` among those that the caller has given, if points in layers of a solid are
+    left out."""
     memory: float
+    """Estimated device memory of the run, or of reading its diagram, in bytes."""
 
 
 class GivenPoints(NamedTuple):
-    """How a run uses the points of the caller.
-
-    Attributes
-    ----------
-    near : bool
-        Their mesh nearly has the sizes: it is only corrected.
-    replaced : bool
-        Their mesh is far from the sizes: the run begins with random points.
-    why : str
-        The reason, for the settings of the result; empty if there are no points, or the method keeps their number.
-    """
+    """How a run uses the points of the caller."""
 
     near: bool = False
+    """Their mesh nearly has the sizes: it is only corrected."""
     replaced: bool = False
+    """Their mesh is far from the sizes: the run begins with random points."""
     why: str = ""
+    """The reason, for the settings of the result; empty if there are no points, or the method keeps their number."""
 
 
 @dataclass(frozen=True)
 class Plan:
-    """The schedule of a run.
-
-    Attributes
-    ----------
-    schedule : list of Action
-    error_target : float or None
-        None with methods that have none.
-    trade : str
-        The trade of sizes against shape, in words.
-    """
+    """The schedule of a run."""
 
     schedule: list[Action]
     error_target: float | None = None
+    """float or None. None with methods that have none."""
     trade: str = ""
+    """The trade of sizes against shape, in words."""
 
 
 def prepare(

@@ -90,38 +90,27 @@ def _property(part: str, name: str) -> Any:
 
 @dataclass(frozen=True)
 class Setup:
-    """What all levels of a run have in common.
-
-    Attributes
-    ----------
-    free : Domain
-        Part of the domain, in its frame, in which generators may move.
-    fixed : int
-        Generators with labels below `fixed` do not move.
-    points : (k, d) ndarray
-        Positions of those with the labels 0 to k - 1, on the finest level: first those of the caller, then those
-        around corners and creases, then those beside lines. The other fixed generators are those of layers. Cells
-        beside lines, in layers, and around crowded creases keep their size, which is their target size.
-    factor : float
-        Initial factor on the size field on the finest level.
-    own_factor : float
-        Size of the cells over that of the size field, if a method keeps another number of cells than the field has.
-    around : FixedGenerators or None
-        Generators beside lines, or around corners or creases: the last of `points`.
-    after_layers : Field or None
-        If layers of prisms compress cells, the sizes of cells afterwards; `sizing` has those before.
-    """
+    """What all levels of a run have in common."""
 
     stages: Stages
     domain: Domain
     sizing: Sizing
     free: Domain
+    """Part of the domain, in its frame, in which generators may move."""
     fixed: int
+    """Generators with labels below `fixed` do not move."""
     points: np.ndarray
+    """(k, d) ndarray. Positions of those with the labels 0 to k - 1, on the finest level: first those of the caller,
+    then those around corners and creases, then those beside lines. The other fixed generators are those of layers.
+    Cells beside lines, in layers, and around crowded creases keep their size, which is their target size."""
     factor: float = 1.0
+    """Initial factor on the size field on the finest level."""
     own_factor: float = 1.0
+    """Size of the cells over that of the size field, if a method keeps another number of cells than the field has."""
     around: FixedGenerators | None = None
+    """Generators beside lines, or around corners or creases: the last of `points`."""
     after_layers: Field | None = None
+    """If layers of prisms compress cells, the sizes of cells afterwards; `sizing` has those before."""
 
     @property
     def first_sized(self) -> int:

@@ -22,55 +22,41 @@ RIGHT_ANGLE = 90 + 1e-4
 
 @dataclass(frozen=True, repr=False)
 class CGridMeasures:
-    """Measures for C grids: one per cell (n,), per half-face (m,), or per corner of a cell that is not on a wall (k,).
-
-    Attributes
-    ----------
-    angles : (k,) float
-        Angles of the Delaunay triangles in degrees, each once: the one opposite to the side that belongs to
-        half-face ``corners[k]``, in the triangle around the vertex where that half-face begins. On a sphere these are
-        angles of flat triangles: the vertex is outside of its triangle exactly if one of them is obtuse. Where more
-        than three cells meet, the third corner is any other generator there, and only sides of cells count.
-    corners : (k,) int
-        The half-faces that begin in these corners.
-    kites : (k,) float
-        Signed area of the quadrilateral of generator, middle of one side, vertex and middle of the next side, as a
-        share of the area of its cell. The middles are those of the lines between generators (MPAS: `kiteAreasOnVertex`
-        over `areaCell`). Negative where the vertex is far outside of its triangle.
-    edge_offset : (m,) float
-        Distance between the middle of the Voronoi edge and the middle of its Delaunay edge, over the length of the
-        Voronoi edge (MPAS: `dvEdge`). 0 is ideal. Beyond 1/2 the two edges do not cross: a vertex is outside
-        of its triangle. Infinite for edges without length; 0 on walls. Over the distance of the generators
-        (`dcEdge`) this distance is `Measures.skewness`.
-    length_ratio : (m,) float
-        Length of the Voronoi edge over the distance of its generators (`dvEdge` over `dcEdge`); 0.58 in a lattice of
-        regular hexagons, 0 on walls.
-    centroid_offset : (n,) float
-        Distance from the generator to the centroid over the square root of the cell's area; 0 in a centroidal diagram.
-    edge_ratio : (n,) float
-        Shortest over longest edge of the cell.
-    off_bisector : (m,) float
-        Distance of the ends of the edge from the bisector of its generators, over the distance of these. It is not 0
-        where a part of a cell that the boundary of a polygon cuts off belongs to another cell. 0 on walls.
-    inner : (m,) bool
-        Whether the half-face is between two cells.
-    vertex_cells : (k,) int
-        Number of cells that meet in the vertex; 3 in general.
-    first : (k,) bool
-        True at one corner of each vertex.
-    """
+    """Measures for C grids: one per cell (n,), per half-face (m,), or per corner of a cell, if not on a wall (k,)."""
 
     angles: np.ndarray
+    """(k,) float. Angles of the Delaunay triangles in degrees, each once: the one opposite to the side that belongs to
+    half-face ``corners[k]``, in the triangle around the vertex where that half-face begins. On a sphere these are
+    angles of flat triangles: the vertex is outside of its triangle exactly if one of them is obtuse. Where more than
+    three cells meet, the third corner is any other generator there, and only sides of cells count."""
     corners: np.ndarray
+    """(k,) int. The half-faces that begin in these corners."""
     kites: np.ndarray
+    """(k,) float. Signed area of the quadrilateral of generator, middle of one side, vertex and middle of the next
+    side, as a share of the area of its cell. The middles are those of the lines between generators (MPAS:
+    `kiteAreasOnVertex` over `areaCell`). Negative where the vertex is far outside of its triangle."""
     edge_offset: np.ndarray
+    """(m,) float. Distance between the middle of the Voronoi edge and the middle of its Delaunay edge, over the length
+    of the Voronoi edge (MPAS: `dvEdge`). 0 is ideal. Beyond 1/2 the two edges do not cross: a vertex is outside of its
+    triangle. Infinite for edges without length; 0 on walls. Over the distance of the generators (`dcEdge`) this
+    distance is `Measures.skewness`."""
     length_ratio: np.ndarray
+    """(m,) float. Length of the Voronoi edge over the distance of its generators (`dvEdge` over `dcEdge`); 0.58 in a
+    lattice of regular hexagons, 0 on walls."""
     centroid_offset: np.ndarray
+    """(n,) float. Distance from the generator to the centroid over the square root of the cell's area; 0 in a
+    centroidal diagram."""
     edge_ratio: np.ndarray
+    """(n,) float. Shortest over longest edge of the cell."""
     off_bisector: np.ndarray
+    """(m,) float. Distance of the ends of the edge from the bisector of its generators, over the distance of these. It
+    is not 0 where a part of a cell that the boundary of a polygon cuts off belongs to another cell. 0 on walls."""
     inner: np.ndarray
+    """(m,) bool. Whether the half-face is between two cells."""
     vertex_cells: np.ndarray
+    """(k,) int. Number of cells that meet in the vertex; 3 in general."""
     first: np.ndarray
+    """(k,) bool. True at one corner of each vertex."""
 
     @property
     def obtuse(self) -> int:

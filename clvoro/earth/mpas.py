@@ -271,21 +271,14 @@ def _add_measures(file: NetCDF, around: _Around, shape: Shape, unit: str) -> Non
 
 @dataclass(frozen=True)
 class _Around:
-    """Cells and edges around each vertex, counter-clockwise; at the boundary they begin at the boundary.
-
-    Attributes
-    ----------
-    vertex : (h,) int
-        Number of the vertex where each half-edge begins.
-    corners : (v, k) int
-        The half-edges that begin at each vertex, then -1. Each stands for the corner of its cell.
-    edges : (v, k) int
-        The edges at each vertex, then -1; on the boundary one more than corners.
-    """
+    """Cells and edges around each vertex, counter-clockwise; at the boundary they begin at the boundary."""
 
     vertex: np.ndarray
+    """(h,) int. Number of the vertex where each half-edge begins."""
     corners: np.ndarray
+    """(v, k) int. The half-edges that begin at each vertex, then -1. Each stands for the corner of its cell."""
     edges: np.ndarray
+    """(v, k) int. The edges at each vertex, then -1; on the boundary one more than corners."""
 
 
 def _walk_around(halves: HalfEdges) -> _Around:

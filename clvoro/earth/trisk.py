@@ -21,20 +21,15 @@ from ..mesh.half_faces import HalfEdges
 
 @dataclass(frozen=True)
 class Weights:
-    """Weights as ragged rows, one per edge.
-
-    Attributes
-    ----------
-    counts : (e,) int
-        Number of other edges in each row.
-    edges : (w,) int
-        The other edges, counter-clockwise from the edge on: those of the lower cell, then those of the other cell.
-    values : (w,) float
-    """
+    """Weights as ragged rows, one per edge."""
 
     counts: np.ndarray
+    """(e,) int. Number of other edges in each row."""
     edges: np.ndarray
+    """(w,) int. The other edges, counter-clockwise from the edge on: those of the lower cell, then those of the other
+    cell."""
     values: np.ndarray
+    """(w,) float."""
 
 
 def find_weights(halves: HalfEdges, shares: np.ndarray, lengths: np.ndarray, distances: np.ndarray) -> Weights:

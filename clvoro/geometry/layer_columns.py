@@ -32,24 +32,16 @@ _FINEST = 1e-6  # of the width: the narrowest columns
 
 @dataclass(frozen=True)
 class Chain:
-    """Consecutive edges of the boundary without a sharp turn.
-
-    Attributes
-    ----------
-    corners : (k, 2) float
-        Vertices, with the domain on the left.
-    closed : bool
-        Whether the last vertex is the first one, without a sharp turn there.
-    fan : float
-        Angle at the end by which the boundary turns away from the domain, towards the next chain; 0 for other turns.
-    after_fan : bool
-        Whether the chain before ends in such a turn.
-    """
+    """Consecutive edges of the boundary without a sharp turn."""
 
     corners: np.ndarray
+    """(k, 2) float. Vertices, with the domain on the left."""
     closed: bool
+    """Whether the last vertex is the first one, without a sharp turn there."""
     fan: float
+    """Angle at the end by which the boundary turns away from the domain, towards the next chain; 0 for other turns."""
     after_fan: bool
+    """Whether the chain before ends in such a turn."""
 
 
 def find_chains(polygon: Polygon, chosen: np.ndarray) -> list[Chain]:
@@ -121,29 +113,21 @@ class _Wall:
     Columns are narrower where the wall is curved, so that the wall within a cell is flat beside the height of the first
     layer: a cell of width w bulges by w^2 / (8 r) on a wall of radius r. They are narrower beside corners with a fan,
     too, where the first cell of the fan is as small as the layer is high.
-
-    Attributes
-    ----------
-    corners : (k + 1, 2) float
-    joined : bool
-        Whether the chain is closed and begins between two long edges.
-    along : (k, 2) float
-        The edges as vectors.
-    lengths : (k,) float
-        Lengths of the edges.
-    reached : (k + 1,) float
-        Lengths along the chain up to each corner.
-    grading : ((m,) float, (m,) float) or None
-        Lengths along the chain and the stretched lengths there, linear between them. None if all columns have the
-        largest width.
     """
 
     corners: np.ndarray
+    """(k + 1, 2) float."""
     joined: bool
+    """Whether the chain is closed and begins between two long edges."""
     along: np.ndarray
+    """(k, 2) float. The edges as vectors."""
     lengths: np.ndarray
+    """(k,) float. Lengths of the edges."""
     reached: np.ndarray
+    """(k + 1,) float. Lengths along the chain up to each corner."""
     grading: tuple[np.ndarray, np.ndarray] | None
+    """((m,) float, (m,) float) or None. Lengths along the chain and the stretched lengths there, linear between them.
+    None if all columns have the largest width."""
 
     @classmethod
     def of(cls, chain: Chain, width: float, height: float) -> _Wall:

@@ -34,27 +34,18 @@ _NAMED = 4  # rings at one place that an error lists
 
 @dataclass(frozen=True)
 class Ring:
-    """One closed chain of edges.
-
-    Attributes
-    ----------
-    given : (g, 2) float64
-        The caller's vertices, without a closing vertex.
-    vertices : (k, 2) float64
-        Those that differ from the next one, in the caller's order or in reverse.
-    numbers : (k,) int64
-        Number of each edge in `given`: edge i goes from vertex i to the next.
-    name : str
-        Name in errors: "outer ring", "hole-2"; with several pieces "outer-1" and so on, as its boundary is named.
-    curved : CurvedEdges
-        The curves that edges of `given` stand for.
-    """
+    """One closed chain of edges."""
 
     given: np.ndarray
+    """(g, 2) float64. The caller's vertices, without a closing vertex."""
     vertices: np.ndarray
+    """(k, 2) float64. Those that differ from the next one, in the caller's order or in reverse."""
     numbers: np.ndarray
+    """(k,) int64. Number of each edge in `given`: edge i goes from vertex i to the next."""
     name: str
+    """Name in errors: "outer ring", "hole-2"; with several pieces "outer-1" and so on, as its boundary is named."""
     curved: CurvedEdges
+    """The curves that edges of `given` stand for."""
 
 
 @dataclass(frozen=True)
@@ -63,25 +54,18 @@ class OrientedRings:
 
     Outer rings run counter-clockwise, holes clockwise. Vertices on a straight line are kept, repeated ones are dropped.
     The place of an edge in these arrays is not its number: `edge_numbers` and `places` translate.
-
-    Attributes
-    ----------
-    vertices : (k, 2) float64
-    ring_starts : (r + 1,) int32
-        Ring i is ``vertices[ring_starts[i] : ring_starts[i + 1]]``.
-    next_vertex : (k,) int32
-        Edge e goes from vertex e to vertex ``next_vertex[e]``.
-    edge_numbers : (k,) int32
-        The caller's number of each edge.
-    places : (n,) int32
-        The place of each edge by the caller's number; -1 for an edge without length.
     """
 
     vertices: np.ndarray
+    """(k, 2) float64."""
     ring_starts: np.ndarray
+    """(r + 1,) int32. Ring i is ``vertices[ring_starts[i] : ring_starts[i + 1]]``."""
     next_vertex: np.ndarray
+    """(k,) int32. Edge e goes from vertex e to vertex ``next_vertex[e]``."""
     edge_numbers: np.ndarray
+    """(k,) int32. The caller's number of each edge."""
     places: np.ndarray
+    """(n,) int32. The place of each edge by the caller's number; -1 for an edge without length."""
 
     @classmethod
     def of(cls, rings: Sequence[Ring]) -> OrientedRings:

@@ -28,21 +28,14 @@ _SYSTEM = {
 
 @dataclass(frozen=True)
 class CheckMeshResult:
-    """What `checkMesh` says.
-
-    Attributes
-    ----------
-    ok : bool
-        Whether it prints "Mesh OK".
-    complaints : tuple of str
-        Its lines with three stars.
-    text : str
-        All that it prints.
-    """
+    """What `checkMesh` says."""
 
     ok: bool
+    """Whether it prints "Mesh OK"."""
     complaints: tuple[str, ...]
+    """Its lines with three stars."""
     text: str
+    """All that it prints."""
 
 
 def run_check_mesh(mesh: Result | Diagram, walls: WallShape = "straight") -> CheckMeshResult | None:

@@ -42,20 +42,13 @@ OWN = frozenset(
 
 @dataclass(frozen=True)
 class Contents:
-    """The contents of a mesh file.
-
-    Attributes
-    ----------
-    diagram : Diagram
-    result : Result or None
-        None for a diagram without sizes.
-    extra : dict
-        The caller's data by name, (n,) or (n, k) arrays of float32, float64, int32, int64 or uint8.
-    """
+    """The contents of a mesh file."""
 
     diagram: Diagram
     result: Result | None
+    """None for a diagram without sizes."""
     extra: dict[str, np.ndarray]
+    """The caller's data by name, (n,) or (n, k) arrays of float32, float64, int32, int64 or uint8."""
 
     @classmethod
     def of(cls, mesh: object, cell_data: Mapping[str, ArrayLike] | None = None) -> Contents:

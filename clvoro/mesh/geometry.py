@@ -26,22 +26,16 @@ _CHUNK = 1 << 11
 
 @dataclass(frozen=True, eq=False)
 class Geometry(Sealed):
-    """What follows from the points of polyhedra.
-
-    Attributes
-    ----------
-    centers : (f, 3) float64
-        Centers of the faces.
-    areas : (f, 3) float64
-        Area vectors: normal to the face, out of its owner, as long as its area.
-    centroids : (n, 3) float64
-    volumes : (n,) float64
-    """
+    """What follows from the points of polyhedra."""
 
     centers: np.ndarray
+    """(f, 3) float64. Centers of the faces."""
     areas: np.ndarray
+    """(f, 3) float64. Area vectors: normal to the face, out of its owner, as long as its area."""
     centroids: np.ndarray
+    """(n, 3) float64."""
     volumes: np.ndarray
+    """(n,) float64."""
 
 
 def face_vectors(points: np.ndarray, starts: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -16,25 +16,17 @@ SMALL = 0.005
 
 @dataclass
 class Cost:
-    """Time and memory traffic of one kernel, or of several.
-
-    Attributes
-    ----------
-    calls : int
-    seconds : float
-        Device time, from start to end of each call.
-    bytes : int
-        Sizes of the buffers that were bound to the calls, each buffer once a call: an estimate of
-        the memory traffic. It is too high where a call uses a part of a buffer only, and too low
-        where memory is read and written, or read twice.
-    seconds_known : float
-        Time of those calls whose buffers are known.
-    """
+    """Time and memory traffic of one kernel, or of several."""
 
     calls: int = 0
     seconds: float = 0.0
+    """Device time, from start to end of each call."""
     bytes: int = 0
+    """Sizes of the buffers that were bound to the calls, each buffer once a call: an estimate of the memory traffic. It
+    is too high where a call uses a part of a buffer only, and too low where memory is read and written, or read
+    twice."""
     seconds_known: float = 0.0
+    """Time of those calls whose buffers are known."""
 
     def __add__(self, other: Cost) -> Cost:
         return Cost(

@@ -24,27 +24,18 @@ ITEM_GROUP = 64
 
 
 class Traits(NamedTuple):
-    """What kernels are built for, and take as arguments, besides dimension and precision.
-
-    Attributes
-    ----------
-    macros : tuple of str
-        Macros that are set.
-    periods : tuple of 3 floats, or empty
-        PERIOD_ARGS of kernels, in the device's coordinates; 0 where there are walls.
-    curved : bool
-        Whether cells have one dimension less than positions.
-    cut : bool
-        Whether cells in 2D are cut after they were clipped: then faces are measured in full precision.
-    site_values : int
-        Numbers per generator besides its coordinates.
-    """
+    """What kernels are built for, and take as arguments, besides dimension and precision."""
 
     macros: tuple[str, ...] = ()
+    """Macros that are set."""
     periods: tuple[float, ...] = ()
+    """tuple of 3 floats, or empty. PERIOD_ARGS of kernels, in the device's coordinates; 0 where there are walls."""
     curved: bool = False
+    """Whether cells have one dimension less than positions."""
     cut: bool = False
+    """Whether cells in 2D are cut after they were clipped: then faces are measured in full precision."""
     site_values: int = 0
+    """Numbers per generator besides its coordinates."""
 
 
 PLAIN = Traits()
@@ -52,18 +43,12 @@ PLAIN = Traits()
 
 
 class GroupSizes(NamedTuple):
-    """Work-groups of block-wise kernels (scans, reductions).
-
-    Attributes
-    ----------
-    groups : int
-        Number of groups.
-    group_size : int
-        Work-items per group.
-    """
+    """Work-groups of block-wise kernels (scans, reductions)."""
 
     groups: int
+    """Number of groups."""
     group_size: int
+    """Work-items per group."""
 
 
 def group_sizes(device: cl.Device) -> GroupSizes:
@@ -78,21 +63,14 @@ def group_sizes(device: cl.Device) -> GroupSizes:
 
 
 class PartialSums(NamedTuple):
-    """Sums over the cells of a part, which the other parts have, too.
-
-    Attributes
-    ----------
-    partial : (q * groups,) real, device
-        A row of `groups` sums for each of q quantities.
-    rows : tuple of k int
-        The rows to be summed over all parts.
-    largest : int, optional
-        A row of `rows` of which all parts need the maximum in place of the sum.
-    """
+    """Sums over the cells of a part, which the other parts have, too."""
 
     partial: cla.Array
+    """(q * groups,) real, device. A row of `groups` sums for each of q quantities."""
     rows: tuple[int, ...]
+    """tuple of k int. The rows to be summed over all parts."""
     largest: int | None = None
+    """int, optional. A row of `rows` of which all parts need the maximum in place of the sum."""
 
 
 class Engine:

@@ -11,18 +11,12 @@ from .kernels import bind
 
 
 class CostFactors(NamedTuple):
-    """Costs on a device, relative to PoCL on two cores.
-
-    Attributes
-    ----------
-    launches : float
-        Of a launch, or of a read of some numbers by the host.
-    cells : float
-        Of a pass over the cells and their faces, which moves memory.
-    """
+    """Costs on a device, relative to PoCL on two cores."""
 
     launches: float
+    """Of a launch, or of a read of some numbers by the host."""
     cells: float
+    """Of a pass over the cells and their faces, which moves memory."""
 
 
 COSTS_ON_CPU = CostFactors(1.0, 1.0)

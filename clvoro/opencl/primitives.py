@@ -202,21 +202,14 @@ class Gather:
 
 
 class Lists(NamedTuple):
-    """Device arrays that say how lists of rows, which follow one another in an array, change places.
-
-    Attributes
-    ----------
-    order : (n,) int32
-        Present place of each list in the new order.
-    starts : (n + 1,) int32
-        Where the present lists begin.
-    to : (n or more,) int32
-        Where the lists begin in the new order.
-    """
+    """Device arrays that say how lists of rows, which follow one another in an array, change places."""
 
     order: cla.Array
+    """(n,) int32. Present place of each list in the new order."""
     starts: cla.Array
+    """(n + 1,) int32. Where the present lists begin."""
     to: cla.Array
+    """(n or more,) int32. Where the lists begin in the new order."""
 
 
 def _words_of(array: cla.Array) -> np.int32:

@@ -27,17 +27,11 @@ def may_be_interrupted(device: cl.Device) -> bool:
 
 @dataclass
 class Range:
-    """The size of a kernel's next range, shared by all objects of the kernel.
-
-    Attributes
-    ----------
-    items : float
-    known : bool
-        Whether a range has been timed.
-    """
+    """The size of a kernel's next range, shared by all objects of the kernel."""
 
     items: float = FIRST
     known: bool = False
+    """Whether a range has been timed."""
 
     def learn(self, size: int, seconds: float) -> None:
         """Set the size by the time of a range of `size` items."""

@@ -43,29 +43,19 @@ _DIVERGING = LinearSegmentedColormap.from_list("error", colormaps["RdBu_r"](np.l
 
 @dataclass(frozen=True)
 class Coloring:
-    """A quantity that colors cells.
-
-    Attributes
-    ----------
-    label : str
-        With its unit, for the color bar.
-    values : function of a Result
-        One number per cell.
-    color_map : str or color map
-        Perceptually uniform; diverging around zero for a signed quantity.
-    limits : function of the values
-        The two ends of the scale.
-    logarithmic : bool
-    classes : tuple of str
-        Names of integer values, from the lower limit on; empty for a continuous quantity.
-    """
+    """A quantity that colors cells."""
 
     label: str
+    """With its unit, for the color bar."""
     values: Callable[[Result], np.ndarray]
+    """One number per cell."""
     color_map: Any
+    """Perceptually uniform; diverging around zero for a signed quantity."""
     limits: Callable[[np.ndarray], tuple[float, float]]
+    """The two ends of the scale."""
     logarithmic: bool = False
     classes: tuple[str, ...] = ()
+    """Names of integer values, from the lower limit on; empty for a continuous quantity."""
     unit: float = 1.0  # of the numbers beside the color bar
 
 
@@ -210,19 +200,13 @@ def kilometer_of(radius: float) -> float | None:
 
 @dataclass(frozen=True)
 class Paint:
-    """The colors of values, usually one for each cell.
-
-    Attributes
-    ----------
-    scheme : Coloring
-    values : (n,) float
-    limits : (low, high)
-        Ends of the color scale.
-    """
+    """The colors of values, usually one for each cell."""
 
     scheme: Coloring
     values: np.ndarray
+    """(n,) float."""
     limits: tuple[float, float]
+    """(low, high). Ends of the color scale."""
 
     @property
     def norm(self) -> Normalize:

@@ -34,23 +34,16 @@ def round_to_work_group(size: int) -> int:
 
 @dataclass(frozen=True)
 class Graph:
-    """A weighted graph on the device, one row per cell.
-
-    Attributes
-    ----------
-    starts : (n + 1,) int32
-    columns : (m,) int32
-        Entries on the diagonal are ignored. Negative columns (walls) have weight 0.
-    weights : (m,) real
-        Symmetric, >= 0.
-    ghosts : Ghosts, optional
-        Owners of the cells of other parts, which have the columns from n on.
-    """
+    """A weighted graph on the device, one row per cell."""
 
     starts: cla.Array
+    """(n + 1,) int32."""
     columns: cla.Array
+    """(m,) int32. Entries on the diagonal are ignored. Negative columns (walls) have weight 0."""
     weights: cla.Array
+    """(m,) real. Symmetric, >= 0."""
     ghosts: Ghosts | None = None
+    """Owners of the cells of other parts, which have the columns from n on."""
 
     def __len__(self) -> int:
         return len(self.starts) - 1
@@ -68,23 +61,16 @@ class Graph:
 
 @dataclass(frozen=True)
 class Aggregates:
-    """A partition of the cells of a graph.
-
-    Attributes
-    ----------
-    aggregate : (n or more,) int32
-        Number of the aggregate of each cell, then of each cell of other parts.
-    starts : (aggregates + 1,) int32
-    members : (n,) int32
-        Aggregate g has the cells ``members[starts[g]:starts[g + 1]]``.
-    ghosts : Ghosts, optional
-        Owners of the aggregates of other parts.
-    """
+    """A partition of the cells of a graph."""
 
     aggregate: cla.Array
+    """(n or more,) int32. Number of the aggregate of each cell, then of each cell of other parts."""
     starts: cla.Array
+    """(aggregates + 1,) int32."""
     members: cla.Array
+    """(n,) int32. Aggregate g has the cells ``members[starts[g]:starts[g + 1]]``."""
     ghosts: Ghosts | None = None
+    """Owners of the aggregates of other parts."""
 
     def __len__(self) -> int:
         return len(self.starts) - 1

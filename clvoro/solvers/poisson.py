@@ -65,23 +65,16 @@ def max_jacobi_iterations(n: int) -> int:
 
 @dataclass(frozen=True)
 class Laplacian:
-    """The assembled operator A = -Laplacian, symmetric to the last bit: device arrays.
-
-    Attributes
-    ----------
-    starts : (n + 1,) int32
-    neighbors : (m,) int32
-        Neighbors of the diagram, owners in place of ghosts: walls are negative.
-    weights : (m,) real or float32
-        w_ij = rho_ij l_ij / d_ij; 0 at walls.
-    part : Part, optional
-        If neighbors are ghosts whose owners are in other parts.
-    """
+    """The assembled operator A = -Laplacian, symmetric to the last bit: device arrays."""
 
     starts: cla.Array
+    """(n + 1,) int32."""
     neighbors: cla.Array
+    """(m,) int32. Neighbors of the diagram, owners in place of ghosts: walls are negative."""
     weights: cla.Array
+    """(m,) real or float32. w_ij = rho_ij l_ij / d_ij; 0 at walls."""
     part: Part | None = None
+    """If neighbors are ghosts whose owners are in other parts."""
 
     def __len__(self) -> int:
         return len(self.starts) - 1

@@ -36,29 +36,19 @@ FEW = 20_000
 
 @dataclass
 class Newton:
-    """The steps of a solve.
-
-    Attributes
-    ----------
-    errors : list of float
-        Largest |V - m| / m at the start and after each step.
-    shares : list of float
-        Share of each Newton step that was taken.
-    factor : float
-        Factor on the prescribed volumes that makes their sum that of the domain.
-    converged : bool
-    far : int
-        Number of cells whose error is above the tolerance, at the end.
-    solution : Solution
-        Of the last linear solve.
-    """
+    """The steps of a solve."""
 
     errors: list[float] = field(default_factory=list)
+    """list of float. Largest |V - m| / m at the start and after each step."""
     shares: list[float] = field(default_factory=list)
+    """list of float. Share of each Newton step that was taken."""
     factor: float = 1.0
+    """Factor on the prescribed volumes that makes their sum that of the domain."""
     converged: bool = False
     far: int = 0
+    """Number of cells whose error is above the tolerance, at the end."""
     solution: Solution = field(default_factory=Solution.zero)
+    """Of the last linear solve."""
 
 
 @dataclass

@@ -33,27 +33,19 @@ read then. Further ones cost two launches each."""
 
 
 class Targets(NamedTuple):
-    """Cells against the size field, on the device.
-
-    Attributes
-    ----------
-    h : (n,) real
-        Target size, the unit of displacements.
-    gradient : (n, d) real
-        grad log h.
-    log_ratio : (n,) real
-        r = log(V / h^d).
-    quality : (n,) real
-        Q.
-    sums : (2 k,) real, optional
-        Sums of V rho r and V rho over k parts of the cells: the mean of r is subtracted. See `Density.sum_log_ratio`.
-    """
+    """Cells against the size field, on the device."""
 
     h: cla.Array
+    """(n,) real. Target size, the unit of displacements."""
     gradient: cla.Array
+    """(n, d) real. grad log h."""
     log_ratio: cla.Array
+    """(n,) real. r = log(V / h^d)."""
     quality: cla.Array
+    """(n,) real. Q."""
     sums: cla.Array | None = None
+    """(2 k,) real, optional. Sums of V rho r and V rho over k parts of the cells: the mean of r is subtracted. See
+    `Density.sum_log_ratio`."""
 
 
 class Penalty(NamedTuple):

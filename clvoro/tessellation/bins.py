@@ -52,33 +52,24 @@ def root_edge(extent: np.ndarray, n: int) -> float:
 
 @dataclass(frozen=True)
 class BinnedPoints:
-    """Generators in bins, on the device; see `tessellation/bins.h` for the layout.
-
-    Attributes
-    ----------
-    items : (>= n,) int32
-        Generator indices in bin order, ascending within a bin.
-    points : (>= n, d) real
-        Positions in the same order.
-    reach : (>= n,) float32
-        Edge of the leaf that holds the generator, in the same order.
-    spacing : (>= n,) float32
-        Estimated edge of a bin with `OCCUPANCY` generators, from the bins around the leaf.
-    bins : (b, 2) int32
-    grid_frames : (g, 4) real
-    grid_shapes : (g, 4) int32
-    sides : d integers, on the host
-        Bins of the first grid along each axis.
-    """
+    """Generators in bins, on the device; see `tessellation/bins.h` for the layout."""
 
     items: cla.Array
+    """(>= n,) int32. Generator indices in bin order, ascending within a bin."""
     points: cla.Array
+    """(>= n, d) real. Positions in the same order."""
     reach: cla.Array
+    """(>= n,) float32. Edge of the leaf that holds the generator, in the same order."""
     spacing: cla.Array
+    """(>= n,) float32. Estimated edge of a bin with `OCCUPANCY` generators, from the bins around the leaf."""
     bins: cla.Array
+    """(b, 2) int32."""
     grid_frames: cla.Array
+    """(g, 4) real."""
     grid_shapes: cla.Array
+    """(g, 4) int32."""
     sides: tuple[int, ...]
+    """d integers, on the host. Bins of the first grid along each axis."""
 
     @property
     def search(self) -> tuple[cla.Array, ...]:

@@ -114,27 +114,19 @@ class CutCells:
 
 @dataclass
 class Matching:
-    """Faces that are matched and sorted by rows on the device, unless `report` says that cells are missing or wrong.
-
-    Attributes
-    ----------
-    cut : CutCells
-    points : (n, 3) real
-    kept : (cut.m,) uint8
-        Whether both cells have the face.
-    starts : (n + 1,) int32
-        Beginning of each row.
-    report : int32
-    arrays : dict
-        Arrays of the diagram.
-    """
+    """Faces that are matched and sorted by rows on the device, unless `report` says that cells are missing or wrong."""
 
     cut: CutCells
     points: cla.Array
+    """(n, 3) real."""
     kept: cla.Array
+    """(cut.m,) uint8. Whether both cells have the face."""
     starts: cla.Array
+    """(n + 1,) int32. Beginning of each row."""
     report: cla.Array
+    """int32."""
     arrays: dict[str, Any] = field(default_factory=dict)
+    """Arrays of the diagram."""
 
     def tessellation(self, flags: int = 0) -> Tessellation:
         """Return the diagram. `flags` are those of the report."""

@@ -115,64 +115,48 @@ def domain_position(domain: Domain, place: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Tessellation:
-    """A Voronoi or power diagram on the device: normalized coordinates, vectors relative to the generator of the row.
-
-    Attributes
-    ----------
-    n : int
-    points : (n, d) real
-    starts : (n + 1,) int32
-    neighbors : (m,) int32
-        A generator, or ``-1 - wall``; counter-clockwise in 2D.
-    face_measures : (m,) real, or single
-    face_centroids : (m, d) real, or single
-        Relative to the generator; see `Engine.face` for the precision.
-    volumes : (n,) real
-    offsets : (n, d) real
-        Centroid minus generator: the Lloyd displacement.
-    covariances : (n, 3) or (n, 6) real
-        Second moments about the centroid per unit volume: xx, xy, yy in 2D, on a sphere along the tangents at the
-        generator (geometry/site.h); xx, xy, xz, yy, yz, zz in 3D.
-    sites : (n, d) or (n, d + 1) real
-        The generators as kernels of the tessellation take them: in a power diagram each row ends with the weight.
-    outlines : tuple of arrays
-        The OUTLINE_ARGS of kernels (tessellation/clipped/outline.h): empty where no boundary cuts cells.
-    vertices : tuple of arrays
-        In 3D, while generators move: the vertices as triples of faces, (2 m,) uint32, and the keys of the faces, (m,)
-        uint32 (tessellation/polyhedra_update.cl); else empty.
-    part : Part, optional
-        The part whose rows `neighbors` and `points` name. None if these are the n generators, as in a folded diagram.
-    whole : Tessellation, optional
-        The diagram of a part with the cells of ghosts, if they have been built.
-    folded : Folded, optional
-        How the diagram was made from that of generators and images. None after an update, and without images.
-    trimmed : Trimmed, optional
-        How a boundary cut it out of convex cells. None where no boundary cuts cells.
-    reach : (n,) float32, optional
-        Distance of the farthest corner of each cell from its generator, or a bound of it, if the domain has parts.
-    round_off : int
-        What round-off may have spoiled, for `topology3d.consistency`: bits `NARROW`, faces may be no wider than
-        round-off, and `UNEVEN`, cells may differ about their common faces by more than a thousandth of a cell.
-    """
+    """A Voronoi or power diagram on the device: normalized coordinates, vectors relative to the row's generator."""
 
     n: int
     points: cla.Array
+    """(n, d) real."""
     starts: cla.Array
+    """(n + 1,) int32."""
     neighbors: cla.Array
+    """(m,) int32. A generator, or ``-1 - wall``; counter-clockwise in 2D."""
     face_measures: cla.Array
+    """(m,) real, or single."""
     face_centroids: cla.Array
+    """(m, d) real, or single. Relative to the generator; see `Engine.face` for the precision."""
     volumes: cla.Array
+    """(n,) real."""
     offsets: cla.Array
+    """(n, d) real. Centroid minus generator: the Lloyd displacement."""
     covariances: cla.Array
+    """(n, 3) or (n, 6) real. Second moments about the centroid per unit volume: xx, xy, yy in 2D, on a sphere along the
+    tangents at the generator (geometry/site.h); xx, xy, xz, yy, yz, zz in 3D."""
     outlines: tuple[cla.Array, ...] = ()
+    """The OUTLINE_ARGS of kernels (tessellation/clipped/outline.h): empty where no boundary cuts cells."""
     vertices: tuple[cla.Array, ...] = ()
+    """In 3D, while generators move: the vertices as triples of faces, (2 m,) uint32, and the keys of the faces, (m,)
+    uint32 (tessellation/polyhedra_update.cl); else empty."""
     part: Part | None = None
+    """The part whose rows `neighbors` and `points` name. None if these are the n generators, as in a folded diagram."""
     whole: Tessellation | None = None
+    """The diagram of a part with the cells of ghosts, if they have been built."""
     folded: Folded | None = None
+    """How the diagram was made from that of generators and images. None after an update, and without images."""
     trimmed: Trimmed | None = None
+    """How a boundary cut it out of convex cells. None where no boundary cuts cells."""
     reach: cla.Array | None = None
+    """(n,) float32, optional. Distance of the farthest corner of each cell from its generator, or a bound of it, if the
+    domain has parts."""
     round_off: int = 0
+    """What round-off may have spoiled, for `topology3d.consistency`: bits `NARROW`, faces may be no wider than
+    round-off, and `UNEVEN`, cells may differ about their common faces by more than a thousandth of a cell."""
     sites: cla.Array = None  # type: ignore[assignment]
+    """(n, d) or (n, d + 1) real. The generators as kernels of the tessellation take them: in a power diagram each row
+    ends with the weight."""
 
     def __post_init__(self) -> None:
         if self.sites is None:
@@ -240,17 +224,13 @@ def read_report(_: Tessellation, report: cla.Array | None) -> list[int]:
 
 @dataclass(frozen=True)
 class NeighborRows:
-    """Neighbors that the cells of `n` generators start from, on the device; -1 for none.
-
-    Attributes
-    ----------
-    starts : (n + 1,) int32
-    neighbors : (m,) int32
-    """
+    """Neighbors that the cells of `n` generators start from, on the device; -1 for none."""
 
     n: int
     starts: cla.Array
+    """(n + 1,) int32."""
     neighbors: cla.Array
+    """(m,) int32."""
 
     @classmethod
     def copy_of(cls, t: Tessellation) -> NeighborRows:

@@ -16,32 +16,24 @@ CROWDED = 1 << 16
 
 @dataclass
 class FaceRows:
-    """Rows of faces of a diagram under construction, in scratch memory of the device; see `tessellation/face_rows.h`.
-
-    Attributes
-    ----------
-    slots : (s * SLOT,) int32
-    counts : (s,) int32
-        Number of faces of the row that begins in each slot; negative if the cell is doubtful due to round-off.
-    keep : (s,) uint32
-        Bits of the faces that both cells have.
-    places : (n,) int32
-        First slot of each row; -1 for a row of the previous graph.
-    starts : (n + 1,) int32
-        Beginning of each row in the new graph.
-    report : int32
-        See `tessellation/report.h`.
-    old : tuple of (n + 1,) int32 and int32
-        Starts and neighbors of the previous graph; `places` twice if all rows are new.
-    """
+    """Rows of faces of a diagram under construction, in scratch memory; see `tessellation/face_rows.h`."""
 
     slots: cla.Array
+    """(s * SLOT,) int32."""
     counts: cla.Array
+    """(s,) int32. Number of faces of the row that begins in each slot; negative if the cell is doubtful due to
+    round-off."""
     keep: cla.Array
+    """(s,) uint32. Bits of the faces that both cells have."""
     places: cla.Array
+    """(n,) int32. First slot of each row; -1 for a row of the previous graph."""
     starts: cla.Array
+    """(n + 1,) int32. Beginning of each row in the new graph."""
     report: cla.Array
+    """int32. See `tessellation/report.h`."""
     old: tuple[cla.Array, cla.Array]
+    """tuple of (n + 1,) int32 and int32. Starts and neighbors of the previous graph; `places` twice if all rows are
+    new."""
 
     @property
     def n(self) -> int:

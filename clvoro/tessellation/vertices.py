@@ -19,20 +19,13 @@ MOST_AROUND = 10_000
 
 @dataclass(frozen=True)
 class Vertices:
-    """Shared vertices, on the device.
-
-    Attributes
-    ----------
-    count : int
-    positions : (count, d) real
-        In normalized coordinates.
-    cell_vertices : (m,) int32
-        Vertex at the beginning of each face of the graph. Faces of a cell run counter-clockwise.
-    """
+    """Shared vertices, on the device."""
 
     count: int
     positions: cla.Array
+    """(count, d) real. In normalized coordinates."""
     cell_vertices: cla.Array
+    """(m,) int32. Vertex at the beginning of each face of the graph. Faces of a cell run counter-clockwise."""
 
 
 class VertexNumbering:

@@ -19,16 +19,10 @@ from ..tuning import FULL_RATE
 
 @dataclass(frozen=True)
 class Repulsion:
-    """The energy ``stiffness / 2 max(0, length - l / h)^2`` of two points at the distance l.
-
-    Attributes
-    ----------
-    length : float
-        Distance over h below which they are pushed apart.
-    stiffness : float
-    """
+    """The energy ``stiffness / 2 max(0, length - l / h)^2`` of two points at the distance l."""
 
     length: float
+    """Distance over h below which they are pushed apart."""
     stiffness: float
 
 

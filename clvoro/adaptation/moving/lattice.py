@@ -66,20 +66,14 @@ def _rows(extent: np.ndarray, n: int, count: int, shift: int | None = None) -> n
 
 @dataclass(frozen=True)
 class Mirrored:
-    """Points of a box, followed by their mirror images near its walls.
-
-    Attributes
-    ----------
-    points : (n + g, d) float64
-    owners : (n + g,) int32
-        The point that each one is, or is an image of.
-    codes : (n + g,) int32
-        Two bits per axis: 1 and 2 for the image at the lower and at the upper wall.
-    """
+    """Points of a box, followed by their mirror images near its walls."""
 
     points: np.ndarray
+    """(n + g, d) float64."""
     owners: np.ndarray
+    """(n + g,) int32. The point that each one is, or is an image of."""
     codes: np.ndarray
+    """(n + g,) int32. Two bits per axis: 1 and 2 for the image at the lower and at the upper wall."""
 
 
 def mirrored(points: np.ndarray, lower: np.ndarray, upper: np.ndarray, depth: float) -> Mirrored:

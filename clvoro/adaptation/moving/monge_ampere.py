@@ -149,27 +149,18 @@ def _solve(matrix: scipy.sparse.csr_array, side: np.ndarray) -> tuple[np.ndarray
 
 @dataclass
 class MongeAmpereMethod(Method):
-    """One step of Newton's method for the Monge-Ampere equation. `mesh.potential` is phi.
-
-    Attributes
-    ----------
-    lattice : (n, d) float64
-        The generators at the start, in the order of their labels.
-    tolerance : float
-        Standard deviation of the logarithm of rho det(I + H) below which the method is finished.
-    share : float
-        Share of Newton's step that the last step has taken.
-    warned : int
-        1 after a warning. Then the map stays.
-    finished : bool
-        Whether the equation is solved to the tolerance.
-    """
+    """One step of Newton's method for the Monge-Ampere equation. `mesh.potential` is phi."""
 
     lattice: np.ndarray = field(repr=False)
+    """(n, d) float64. The generators at the start, in the order of their labels."""
     tolerance: float = 1e-3
+    """Standard deviation of the logarithm of rho det(I + H) below which the method is finished."""
     share: float = 1.0
+    """Share of Newton's step that the last step has taken."""
     warned: int = 0
+    """1 after a warning. Then the map stays."""
     finished: bool | None = False
+    """Whether the equation is solved to the tolerance."""
     map: LatticeMap | None = field(default=None, repr=False)
 
     def step(self, mesh: MeshState) -> Displacement:

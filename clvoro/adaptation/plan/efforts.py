@@ -13,17 +13,10 @@ from .actions import RepairCells
 
 @dataclass(frozen=True)
 class LoosePolish:
-    """Polishing with a large error target: the penalty has to grow, and shape relaxes over many cells.
-
-    Attributes
-    ----------
-    above : float
-        Error target above which it is used.
-    steps : int
-    momentum : float
-    """
+    """Polishing with a large error target: the penalty has to grow, and shape relaxes over many cells."""
 
     above: float
+    """Error target above which it is used."""
     steps: int
     momentum: float
 

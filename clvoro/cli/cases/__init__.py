@@ -29,20 +29,13 @@ __all__ = ["WRITTEN", "Case", "builtin_cases", "load_case"]
 
 @dataclass(frozen=True)
 class Case:
-    """One case file, checked.
-
-    Attributes
-    ----------
-    table : dict
-        What the file holds, by the tables and keys of `schema.CaseTable`, with a name and a title.
-    domain : Domain
-    folder : Path
-        Folder of the files that the case names; those of the built-in cases are found, too.
-    """
+    """One case file, checked."""
 
     table: dict[str, Any]
+    """What the file holds, by the tables and keys of `schema.CaseTable`, with a name and a title."""
     domain: Domain
     folder: Path = Path()
+    """Folder of the files that the case names; those of the built-in cases are found, too."""
 
     @classmethod
     def from_toml(cls, text: str, name: str, folder: Path = Path()) -> Case:

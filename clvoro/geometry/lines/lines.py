@@ -27,20 +27,14 @@ _EXPECTED = "points (k, 2), curves of clvoro.curves, lines or polygons of shapel
 
 
 class Network(NamedTuple):
-    """The lines in a domain, divided where they meet.
-
-    Attributes
-    ----------
-    nodes : (k, 2) float64
-        Ends of chains. Ends that differ by a period are one node.
-    chains : list of (m, 2) float64
-    ends : (c, 2) int
-        The nodes at both ends of each chain.
-    """
+    """The lines in a domain, divided where they meet."""
 
     nodes: np.ndarray
+    """(k, 2) float64. Ends of chains. Ends that differ by a period are one node."""
     chains: list[np.ndarray]
+    """list of (m, 2) float64."""
     ends: np.ndarray
+    """(c, 2) int. The nodes at both ends of each chain."""
 
 
 class Lines(Borders):

@@ -22,21 +22,14 @@ The tolerance of a corner is larger where its faces are nearly parallel; see `Re
 
 @dataclass(frozen=True)
 class Finding:
-    """One property that does not hold.
-
-    Attributes
-    ----------
-    name : str
-        Name of the property, such as ``"volumes sum"``.
-    message : str
-        The value, the expected value, and the place with the largest deviation.
-    count : int
-        Number of places.
-    """
+    """One property that does not hold."""
 
     name: str
+    """Name of the property, such as ``"volumes sum"``."""
     message: str
+    """The value, the expected value, and the place with the largest deviation."""
     count: int = 1
+    """Number of places."""
 
     def __str__(self) -> str:
         return f"{self.name}: {self.message}"

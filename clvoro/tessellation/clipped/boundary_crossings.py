@@ -32,41 +32,28 @@ class BoundaryError(InputError):
 
 @dataclass(frozen=True)
 class Chords:
-    """Chords, edge by edge, and their cells, on the device; see tessellation/clipped/boundary.h.
-
-    Attributes
-    ----------
-    count : int
-    arrays : tuple of arrays
-        The CHORD_ARGS of kernels.
-    slots : (n,) int32
-        Number of each cell among those that the boundary crosses, `UNTOUCHED` for the others.
-    touched : (t,) int32
-        The cells that the boundary crosses.
-    list_starts : (t + 1,) int32
-    listed : (count,) int32
-        The chords of each of these cells, in order.
-    tangents : (edges, 2) real
-        Unit vectors along the edges.
-    turns : tuple of arrays
-        The edge before each edge, and the turning angle between them; see tessellation/clipped/wall_sides.h.
-    shift : (2,) float
-        Shift of the boundary in normalized coordinates.
-    rings : OrientedRings
-        The boundary, in the domain's unit of length.
-    """
+    """Chords, edge by edge, and their cells, on the device; see tessellation/clipped/boundary.h."""
 
     count: int
     touched_count: int
     arrays: tuple[cla.Array, ...]
+    """The CHORD_ARGS of kernels."""
     slots: cla.Array
+    """(n,) int32. Number of each cell among those that the boundary crosses, `UNTOUCHED` for the others."""
     touched: cla.Array
+    """(t,) int32. The cells that the boundary crosses."""
     list_starts: cla.Array
+    """(t + 1,) int32."""
     listed: cla.Array
+    """(count,) int32. The chords of each of these cells, in order."""
     tangents: cla.Array
+    """(edges, 2) real. Unit vectors along the edges."""
     turns: tuple[cla.Array, ...]
+    """The edge before each edge, and the turning angle between them; see tessellation/clipped/wall_sides.h."""
     shift: np.ndarray
+    """(2,) float. Shift of the boundary in normalized coordinates."""
     rings: OrientedRings
+    """The boundary, in the domain's unit of length."""
 
 
 def inward_vectors(domain: Polygon, real: np.dtype) -> np.ndarray:

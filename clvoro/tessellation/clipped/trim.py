@@ -25,50 +25,32 @@ class Trimmed:
     """The convex diagram and the segments that a trimmed diagram was made from, on the device.
 
     Vertices are numbered by these.
-
-    Attributes
-    ----------
-    convex : Tessellation
-    chords : Chords
-    segments : tuple of arrays
-        SEGMENT_ARGS of kernels (tessellation/clipped/segments.h).
-    face_segments : (m,) int32
-        Segment of each face, for cells that the boundary crosses.
-    segment_count : int
     """
 
     convex: Tessellation
     chords: Chords
     segments: tuple[cla.Array, ...]
+    """SEGMENT_ARGS of kernels (tessellation/clipped/segments.h)."""
     face_segments: cla.Array
+    """(m,) int32. Segment of each face, for cells that the boundary crosses."""
     segment_count: int
 
 
 @dataclass(frozen=True)
 class _Pieces:
-    """The pieces into which the boundary cuts convex cells, on the device.
-
-    Attributes
-    ----------
-    segments : tuple of arrays
-        SEGMENT_ARGS of kernels.
-    segment_count : int
-    loop_pieces : (p,) int32
-        Piece of each loop.
-    roots : (p,) int32
-        Generator that owns each piece.
-    marks : (n,) int32
-        1 for uncrossed cells beside a piece that changes cells: they get another neighbor.
-    orphans : tuple
-        The pieces that change cells, (>= count,) int32, and their count.
-    """
+    """The pieces into which the boundary cuts convex cells, on the device."""
 
     segments: tuple[cla.Array, ...]
+    """SEGMENT_ARGS of kernels."""
     segment_count: int
     loop_pieces: cla.Array
+    """(p,) int32. Piece of each loop."""
     roots: cla.Array
+    """(p,) int32. Generator that owns each piece."""
     marks: cla.Array
+    """(n,) int32. 1 for uncrossed cells beside a piece that changes cells: they get another neighbor."""
     orphans: tuple[cla.Array, int]
+    """The pieces that change cells, (>= count,) int32, and their count."""
 
 
 class Trim:

@@ -52,23 +52,16 @@ class Folded:
     """How a diagram was folded: the rows of the generators of a part, with images replaced by their owners.
 
     The neighbor across a face is a generator or an image of it.
-
-    Attributes
-    ----------
-    part : Part
-        Generators and images.
-    codes : (>= m,) int32
-        Code of the image across each face, as in `Ghosts`.
-    places : (m,) int32 or None
-        Index of each face in the diagram of the part; None if it is the same.
-    whole : Tessellation or None
-        The diagram of the part, if it has the cells of images as well.
     """
 
     part: Part
+    """Generators and images."""
     codes: cla.Array
+    """(>= m,) int32. Code of the image across each face, as in `Ghosts`."""
     places: cla.Array | None
+    """(m,) int32 or None. Index of each face in the diagram of the part; None if it is the same."""
     whole: Tessellation | None
+    """The diagram of the part, if it has the cells of images as well."""
 
 
 class GhostImages:

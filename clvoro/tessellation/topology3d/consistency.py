@@ -30,28 +30,20 @@ _LARGEST = 2**31 - 1
 
 @dataclass(frozen=True)
 class SharedFaces:
-    """Vertices and the loops of faces, on the device.
-
-    Attributes
-    ----------
-    positions : (v, 3) real
-        In the order of the first cell that has the vertex.
-    starts : (m + 1,) int32
-        The loop of face k is ``vertices[starts[k]:starts[k + 1]]``, counter-clockwise as seen from outside of its cell,
-        reversed in the row of the neighbor. Both are empty where the face is no wider than round-off: the other faces
-        close both cells without it.
-    vertices : (l,) int32
-    merged : bool
-        Whether vertices have been merged: some faces may then have no area.
-    needs_check : bool
-        Whether the tolerance was so large that the diagram has to be checked.
-    """
+    """Vertices and the loops of faces, on the device."""
 
     positions: cla.Array
+    """(v, 3) real. In the order of the first cell that has the vertex."""
     starts: cla.Array
+    """(m + 1,) int32. The loop of face k is ``vertices[starts[k]:starts[k + 1]]``, counter-clockwise as seen from
+    outside of its cell, reversed in the row of the neighbor. Both are empty where the face is no wider than round-off:
+    the other faces close both cells without it."""
     vertices: cla.Array
+    """(l,) int32."""
     merged: bool
+    """Whether vertices have been merged: some faces may then have no area."""
     needs_check: bool
+    """Whether the tolerance was so large that the diagram has to be checked."""
 
 
 def share_faces(engine: Engine, box: ClipBox, t: Tessellation) -> SharedFaces:
