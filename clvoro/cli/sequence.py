@@ -37,11 +37,6 @@ def run_frames(
 
     Frame k of n has the time k / n. The files are ``frames/mesh-KKK.vtu``, ``frames.csv`` with `COLUMNS`, and with
     `pictures` ``pictures/frames.png``. The sequence ends early if `stop` returns True; `tell` gets progress texts.
-
-    Returns
-    -------
-    list of dict
-        One per frame, the first included.
     """
     folder = out / "frames"
     with writing(folder):

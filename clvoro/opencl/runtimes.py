@@ -105,11 +105,6 @@ def register_runtimes() -> list[Path]:
 
     Takes a fraction of a millisecond if neither is installed. Never raises: a missing runtime is reported when a device
     is chosen.
-
-    Returns
-    -------
-    list of pathlib.Path
-        The libraries that were registered.
     """
     if not sys.platform.startswith("linux"):
         return []

@@ -84,10 +84,6 @@ class Workspace:
 
     Steps take arrays of the same sizes in the same order. So the choice of buffers is kept as a tree: if the same
     arrays are in use, the next one of the same shape is the same array.
-
-    Parameters
-    ----------
-    queue : pyopencl.CommandQueue
     """
 
     def __init__(self, queue: cl.CommandQueue) -> None:

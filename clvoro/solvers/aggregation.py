@@ -100,11 +100,6 @@ class Aggregation:
     matched. After `MATCHING_ROUNDS` rounds the remaining cells join the pair of their strongest neighbor. The strength
     of a connection is w (1/d_i + 1/d_j), d the row sums of the weights: on meshes with a density all heavy neighbors of
     a cell lie on one side, and the share of the cell's weights matters.
-
-    Parameters
-    ----------
-    engine : Engine
-        In the precision of the multigrid.
     """
 
     def __init__(self, engine: Engine) -> None:

@@ -33,10 +33,6 @@ class ConjugateGradient:
     convergence so far, and then reads one row of scalars per iteration. The iterate is frozen on the device when the
     tolerance is met, so the result does not depend on when the host reads. From zero the first read also fetches the
     norm of the right side.
-
-    Parameters
-    ----------
-    engine : Engine
     """
 
     def __init__(self, engine: Engine) -> None:
@@ -86,10 +82,6 @@ class ConjugateGradient:
             Start from zero and ignore `x`. This saves an application of the operator.
         store : numpy.dtype, optional
             Type of the iteration's vectors: the engine's precision, or float32 for a large tolerance.
-
-        Returns
-        -------
-        Solution
 
         Raises
         ------

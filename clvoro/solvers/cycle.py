@@ -48,11 +48,6 @@ class Cycle:
     of smoothing from zero; restriction of the defect; prolongation and a step; the last step. On CPUs it takes ten,
     because evaluating values several times costs more there than storing them. All have the same bits.
 
-    Parameters
-    ----------
-    engine : Engine
-        In the precision of the multigrid.
-
     Attributes
     ----------
     merged : bool

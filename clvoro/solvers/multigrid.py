@@ -49,10 +49,6 @@ class Multigrid:
 
     Over several parts each aggregate has cells of one part, and each smoothing step needs values of the others. From
     the first level of at most `GATHERED` cells on, each part has the whole levels and does the same work there.
-
-    Parameters
-    ----------
-    engine : Engine
     """
 
     def __init__(self, engine: Engine) -> None:

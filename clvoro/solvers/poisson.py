@@ -102,12 +102,7 @@ class _Equation:
 
 
 class Poisson:
-    """Assembles and solves A phi = b with zero flux through the walls.
-
-    Parameters
-    ----------
-    engine : Engine
-    """
+    """Assembles and solves A phi = b with zero flux through the walls."""
 
     def __init__(self, engine: Engine) -> None:
         self.engine = engine
@@ -289,10 +284,6 @@ class Poisson:
             Start from zero and ignore `potential`.
         max_cycles : int, optional
             Most iterations with multigrid, whatever their residual.
-
-        Returns
-        -------
-        Solution
 
         Raises
         ------

@@ -137,13 +137,7 @@ class SolidBox(ClipBox):
 
 
 class SurfaceSearch:
-    """Finds the nearest triangles of the surface of a solid.
-
-    Parameters
-    ----------
-    engine : Engine
-        Of the domain.
-    """
+    """Finds the nearest triangles of the surface of a solid."""
 
     def __init__(self, engine: Engine, domain: Domain, walls: WallTriangles) -> None:
         self._engine, self._frame, self._walls = engine, domain.frame, walls

@@ -16,7 +16,6 @@ from clvoro.io.vtu_read import load_vtu
 from clvoro.mesh.straightening import count_sides
 from tests.io import test_foam
 from tests.mesh.test_check import add, put, spoilt, swap
-from tests.reference import solids
 from tests.reference.shores import spit, star
 
 SQUARE = np.array([(0.0, 0), (1, 0), (1, 1), (0, 1)])
@@ -366,42 +365,6 @@ def test_openfoam_cells_are_closed(pond, tmp_path, walls) -> None:
         assert volumes == pytest.approx(pond.diagram.volumes * depth, abs=1e-13)
     change = volumes.sum() / depth / pond.diagram.domain.measure - 1
     assert pond.solver_mesh(walls).area_change == pytest.approx(change, abs=1e-12)
-
-
-def lengths_of(patches: dict, points: np.ndarray, faces: list) -> dict:
-    """Length of each patch, from the areas of its faces."""
-    depth = points[:, 2].max()
-    area = {
-        name: sum(np.linalg.norm(solids.loop_area(points[f])) for f in faces[start : start + count])
-        for name, (kind, count, start) in patches.items()
-        if kind == "wall"
-    }
-    return {name: a / depth for name, a in area.items()}
-
-
-def test_openfoam_patches(pond, tmp_path) -> None:
-    domain, folder = pond.diagram.domain, tmp_path / "polyMesh"
-    pond.to_openfoam(folder, walls="exact", check=False)
-    points, faces, *_, patches = test_foam.read(folder)
-    assert list(patches) == ["outer", "hole-1", "hole-2", "back", "front"]
-    rings = [shapely.LinearRing(ring).length for ring in domain.oriented.rings]
-    assert list(lengths_of(patches, points, faces).values()) == pytest.approx(rings, rel=1e-12)
-    given = domain.vertices
-    edges = {"in": [0], "walls": [3, 7, 1]}
-    pond.to_openfoam(folder, patches=edges, walls="exact", check=False)
-    points, faces, *_, patches = test_foam.read(folder)
-    assert list(patches) == ["in", "walls", "outer", "hole-1", "hole-2", "back", "front"]
-
-    def length(k: int) -> float:
-        first, count = (0, 6) if k < 6 else (6, 3)
-        return np.linalg.norm(given[k] - given[first + (k + 1 - first) % count])
-
-    found = lengths_of(patches, points, faces)
-    assert found["in"] == pytest.approx(length(0), rel=1e-12)
-    assert found["walls"] == pytest.approx(length(3) + length(7) + length(1), rel=1e-12)
-    assert sum(found.values()) == pytest.approx(sum(rings), rel=1e-12)
-    pond.to_openfoam(folder, patches={"all": range(6)})
-    assert list(test_foam.read(folder)[-1]) == ["all", "hole-1", "hole-2", "back", "front"]
 
 
 @pytest.mark.parametrize(
