@@ -26,20 +26,19 @@ from ..geometry.domain import Domain
 from ..opencl.device_array import buffer_of
 from ..opencl.primitives import NamedArrays
 from .cut_cells import CutCells
-from .decomposition import hilbert_keys
 from .device_diagram import Follow, Tessellation
 from .part import Ghosts, Part
 from .polyhedra import Polyhedra
 from .stages import TessellationStages
 from .steps import DomainSteps, Sort
 
-FIRST_REACH = 2.4, 3.3
+FIRST_REACH = 2.0, 2.8
 """Radius of the first balls over the spacing of the generators around. The first number holds where only own cells must
 be final (3D), the second where the cells of neighboring ghosts must be final, too (2D)."""
-ROUGH = 12
-"""Bits of a coordinate in the Hilbert keys that order the generators of a part."""
+RUN = 32
+"""Number of successive generators from which their spacing is estimated."""
 JUMP = 8
-"""A new chunk begins where two successive generators on the curve are more than so many spacings apart."""
+"""A new chunk begins where two successive generators are more than so many spacings apart."""
 GROWTH, SKIN = 1.2, 0.15
 """Radius of the balls of a part, over that of the balls that its cells need. Width of the skin around each ball, as a
 share of this radius: a part asks for the generators in the skin, too, because they may move into the ball."""
@@ -61,7 +60,7 @@ FAILED = np.array([0.0, 0.0, 0.0, 0.0, 1.0])
 
 
 class Chunks:
-    """The generators of a part along a Hilbert curve, in chunks of generators near each other.
+    """The generators of a part in chunks of successive ones. Generators in the order of bins are near each other then.
 
     Parameters
     ----------
@@ -71,48 +70,41 @@ class Chunks:
 
     Attributes
     ----------
-    order : (n,) int
-        Generators along the curve.
     firsts : (k,) int
-        Where the chunks begin in `order`.
+        Where the chunks begin.
+    sizes : (k,) int
     spacings : (n,) float
-        For each generator the median distance of two successive ones in its chunk.
+        For each generator an estimate of the spacing around it: the median distance of successive generators in a run
+        of `RUN`, the largest of its run and the two beside it.
     """
 
     def __init__(self, points: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> None:
         n = len(points)
-        self.order = np.argsort(hilbert_keys(points, lower, upper, ROUGH), kind="stable")
+        ways = np.linalg.norm(np.diff(points, axis=0), axis=1)
+        runs = np.arange(max(n // RUN, 1)) * RUN
+        usual = np.full(len(runs), float(np.prod(upper - lower) / n) ** (1 / len(lower)) / 16)
+        if n >= 2 * RUN:
+            usual = np.maximum(usual, np.median(ways[runs[:, None] + np.arange(RUN - 1)], axis=1))
+        usual = np.maximum(usual, np.maximum(np.append(usual[1:], usual[-1]), np.append(usual[0], usual[:-1])))
+        self.spacings = np.repeat(usual, np.diff(np.append(runs, n)))
+        # Generators may have moved far from the others of their part, and the rows of bins have ends.
+        jumps = 1 + np.flatnonzero(ways > JUMP * self.spacings[:-1])
         count = math.isqrt(n)
-        firsts = np.arange(count) * n // count
-        ways = np.linalg.norm(np.diff(points[self.order], axis=0), axis=1)
-        spacings = np.full(count, float(np.prod(upper - lower) / n) ** (1 / len(lower)) / 16)
-        if n >= 2 * count:
-            usual = np.median(ways[firsts[:, None] + np.arange(n // count - 1)], axis=1)
-            spacings = np.maximum(spacings, usual)
-        spacings = np.repeat(spacings, np.diff(np.append(firsts, n)))
-        self.spacings = np.empty(n)
-        self.spacings[self.order] = spacings
-        # Generators may have moved far from the others of their part.
-        jumps = 1 + np.flatnonzero(ways > JUMP * spacings[:-1])
-        self.firsts = np.unique(np.concatenate([firsts, jumps]))
+        self.firsts = np.unique(np.concatenate([np.arange(count) * n // count, jumps]))
+        self.sizes = np.diff(np.append(self.firsts, n))
 
 
 class BallGroups:
-    """The balls in which a part has to know all generators, in groups.
+    """The balls in which a part has to know all generators, in groups: the chunks of their centers.
 
     Parameters
     ----------
     centers : (n, d) float
     radii : (n,) float
     chunks : Chunks
-        The centers in groups.
 
     Attributes
     ----------
-    centers, radii : arrays
-        Those of the balls, group by group.
-    ends : (k + 1,) int
-        Where groups end, after a zero.
     boxes : (k, 2 d) float
         Lower and upper corners of boxes around the centers of each group.
     facts : (k, 2 d + 2) float
@@ -120,13 +112,11 @@ class BallGroups:
     """
 
     def __init__(self, centers: np.ndarray, radii: np.ndarray, chunks: Chunks) -> None:
-        firsts = chunks.firsts
-        self.centers, self.radii = centers[chunks.order], radii[chunks.order]
-        self.ends = np.append(firsts, len(chunks.order))
-        lower, upper = (f.reduceat(self.centers, firsts, axis=0) for f in (np.minimum, np.maximum))
-        self.largest = np.maximum.reduceat(self.radii, firsts)
+        self.centers, self.radii, self.chunks, firsts = centers, radii, chunks, chunks.firsts
+        lower, upper = (f.reduceat(centers, firsts, axis=0) for f in (np.minimum, np.maximum))
+        self.largest = np.maximum.reduceat(radii, firsts)
         self.boxes = np.hstack([lower, upper])
-        self.facts = np.column_stack([self.boxes, self.largest, SKIN * np.minimum.reduceat(self.radii, firsts)])
+        self.facts = np.column_stack([self.boxes, self.largest, SKIN * np.minimum.reduceat(radii, firsts)])
 
     def facing(self, facts: np.ndarray) -> Facing:
         """Return how far these balls are from the boxes of another part, which has sent its `facts` (k, 2 d + 2)."""
@@ -136,8 +126,8 @@ class BallGroups:
         near = np.flatnonzero(away <= reach)
         groups, others = np.nonzero(gaps(self.boxes[near], boxes) <= reach[near, None])
         groups = near[groups]
-        sizes = self.ends[groups + 1] - self.ends[groups]
-        places = np.repeat(self.ends[groups] - np.cumsum(sizes) + sizes, sizes) + np.arange(sizes.sum())
+        sizes = self.chunks.sizes[groups]
+        places = np.repeat(self.chunks.firsts[groups] - np.cumsum(sizes) + sizes, sizes) + np.arange(sizes.sum())
         others = np.repeat(others, sizes)
         dim, ways2 = self.centers.shape[1], np.zeros(len(places))
         for axis in range(dim):
@@ -305,7 +295,7 @@ class PartSteps(DomainSteps):
 
     def _store(self) -> None:
         """Upload the lists of ghosts, and get their labels from their owners."""
-        engine, n = self.stages.engine, len(self._chunks.order)
+        engine, n = self.stages.engine, len(self._caps)
         order = np.argsort(self._parts, kind="stable")
         self._parts, self._rows = self._parts[order], self._rows[order]
         self._ghosts = Ghosts.of_lists(engine, self.peers, self._parts, self._rows, self._sent)
@@ -316,7 +306,7 @@ class PartSteps(DomainSteps):
 
     def _note(self, points: cla.Array) -> None:
         """Keep the positions of own generators, for which the limits hold, and upload the limits."""
-        engine, n = self.stages.engine, len(self._chunks.order)
+        engine, n = self.stages.engine, len(self._caps)
         self._at = self._room("at", size=n * engine.dim).reshape(n, engine.dim)
         cl.enqueue_copy(engine.queue, buffer_of(self._at), buffer_of(points), byte_count=self._at.nbytes)
         # Rounded towards smaller ones.
@@ -422,13 +412,13 @@ class PartSteps(DomainSteps):
             Radii of the balls to ask for, and of the balls that the present cells need.
         """
         self.asked += 1
-        order, peers, balls = self._chunks.order, self.peers, BallGroups(x, radii, self._chunks)
+        peers, balls = self.peers, BallGroups(x, radii, self._chunks)
         told = peers.exchange([balls.facts] * peers.count)
         facing = {number: balls.facing(told[number]) for number in range(peers.count) if number != peers.number}
         none = np.empty(0, int)
         asked = [balls.meeting(facing[number]) if number in facing else none for number in range(peers.count)]
-        sizes = np.column_stack([needed[order], (1 + SKIN) * balls.radii])
-        wanted = peers.exchange([np.hstack([balls.centers[rows], sizes[rows]]) for rows in asked])
+        sizes = np.column_stack([needed, (1 + SKIN) * radii])
+        wanted = peers.exchange([np.hstack([x[rows], sizes[rows]]) for rows in asked])
         given, sent = [], []
         for requested, known in zip(wanted, self._sent, strict=True):
             rows, places = self._unknown(balls, requested, known)
@@ -446,35 +436,34 @@ class PartSteps(DomainSteps):
 
     def _limit(self, answers: Answers) -> None:
         """Set the limits of own generators."""
-        self._limits = np.empty((len(self._chunks.order), 2))
-        self._limits[self._chunks.order] = np.column_stack(self._limits_of(answers.balls, answers.facing))
-        self._at = None
+        self._limits, self._at = np.column_stack(self._limits_of(answers.balls, answers.facing)), None
 
     def _unknown(self, own: BallGroups, balls: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the own generators in `balls` (m, d + 2) that are not among the `known` ones, and their positions.
 
         A row of `balls` is a center and two radii. The first, which the cells of the other part need, does not count.
         """
-        chunks, dim = self._chunks, own.centers.shape[1]
+        dim = own.centers.shape[1]
         if not len(balls):
             return np.empty(0, np.int32), np.empty((0, dim))
         balls = np.delete(balls, dim, axis=1)
         firsts = np.arange(0, len(balls), GROUP)
         lower = np.minimum.reduceat(balls[:, :dim] - balls[:, dim:], firsts, axis=0)
         groups = np.hstack([lower, np.maximum.reduceat(balls[:, :dim] + balls[:, dim:], firsts, axis=0)])
-        near = (gaps(own.boxes, groups) <= 0).any(axis=1)
-        places = np.flatnonzero(np.repeat(near, np.diff(own.ends)))
-        places = places[~np.isin(chunks.order[places], known)]
-        places = places[inside(own.centers[places], balls)]
-        return chunks.order[places].astype(np.int32), own.centers[places]
+        near = np.repeat((gaps(own.boxes, groups) <= 0).any(axis=1), own.chunks.sizes)
+        near[known] = False
+        rows = np.flatnonzero(near)
+        places = own.centers[rows]
+        found = inside(places, balls)
+        return rows[found].astype(np.int32), places[found]
 
     def _limits_of(self, balls: BallGroups, facing: dict[int, Facing]) -> tuple[np.ndarray, np.ndarray]:
-        """Return the limits of own generators along the curve, (n,) each; see `sum_cells` in part.cl.
+        """Return the limits of own generators, (n,) each; see `sum_cells` in part.cl.
 
         A generator that another part does not know is at least a skin away from each ball of that part. Far from all
         other parts, the radius of a ball is a share of the distance to them.
         """
-        n, sizes = len(self._chunks.order), np.diff(balls.ends)
+        n, sizes = len(balls.radii), self._chunks.sizes
         free, room = np.full(n, np.inf), np.full(n, np.inf)
         for number, f in facing.items():
             largest, skins = f.facts[:, -2], f.facts[:, -1]
@@ -482,12 +471,9 @@ class PartSteps(DomainSteps):
                 np.repeat(values, sizes)
                 for values in (f.away, np.maximum(skins.min(), f.away - np.maximum(largest.max(), FREE * f.away)))
             )
-            np.minimum.at(ways, f.places, f.ways)
-            np.minimum.at(
-                rooms, f.places, np.maximum(skins[f.others], f.ways - np.maximum(largest[f.others], FREE * f.ways))
-            )
-            known = np.zeros(n, bool)
-            known[self._sent[number]] = True
-            rooms[known[self._chunks.order]] = np.inf
+            gap, skin, largest = f.ways, skins[f.others], largest[f.others]
+            np.minimum.at(ways, f.places, gap)
+            np.minimum.at(rooms, f.places, np.maximum(skin, gap - np.maximum(largest, FREE * gap)))
+            rooms[self._sent[number]] = np.inf
             free, room = np.minimum(free, FREE * ways), np.minimum(room, rooms)
         return np.maximum(balls.radii, free), room
