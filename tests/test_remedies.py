@@ -1005,6 +1005,9 @@ ROWS = [
 
 TESTED_IN = {
     "has one value in all cells of the latest time": "foam/test_foam_cases.py::test_bad_input_changes_nothing",
+    "a mesh that the solver moves or refines": "foam/test_foam_cases.py::test_bad_input_changes_nothing",
+    "which writes one for each patch": "foam/test_foam_cases.py::test_bad_input_changes_nothing",
+    "has none of the new cells": "foam/test_foam_cases.py::test_zones_and_groups_follow",
     "U enters the domain with": "foam/test_foam_cases.py::test_bad_input_changes_nothing",
     "do not bound one layer of cells normal to z": "foam/test_foam_cases.py::test_bad_input_changes_nothing",
     "this process was forked": "robustness/test_unattended.py::test_forked_processes_are_told_that_they_cannot_work",

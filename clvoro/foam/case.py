@@ -8,7 +8,7 @@ import os
 import re
 import shutil
 import subprocess
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -129,12 +129,28 @@ class FoamCase:
         """
         for earlier in reversed(self.times()):
             folder = self.folder / earlier.name / "polyMesh"
-            if earlier.value <= time.value and _has(folder, "faces"):
+            if earlier.value <= time.value and has_file(folder, "faces"):
                 return folder
         folder = self.folder / "constant" / "polyMesh"
-        if not _has(folder, "faces"):
+        if not has_file(folder, "faces"):
             raise InputError(f"{self.folder} has no mesh, expected constant/polyMesh; write it by mesh.to_openfoam")
         return folder
+
+    def check_kind(self) -> None:
+        """Raise InputError if the case has several meshes, or one that the solver moves or refines."""
+        if (self.folder / "constant" / "regionProperties").exists():
+            raise InputError(
+                f"{self.folder} has several regions (constant/regionProperties), expected a case with one mesh"
+            )
+        path = self.folder / "constant" / "dynamicMeshDict"
+        text = path.read_text() if path.exists() else ""
+        place = _entry(text, "dynamicFvMesh")
+        kind = text[place] if place else "staticFvMesh"
+        if kind != "staticFvMesh":
+            raise InputError(
+                f"{path} has dynamicFvMesh {kind}, expected staticFvMesh: a mesh that the solver moves or refines "
+                "cannot be adapted; change the entry if the mesh can stand still"
+            )
 
     def fields(self, time: Time) -> list[FoamField]:
         """Return all fields of a time, those that are not in cells included."""
@@ -266,7 +282,8 @@ def check_solver(solver: str) -> list[str]:
     return words
 
 
-def _has(folder: Path, name: str) -> bool:
+def has_file(folder: Path, name: str) -> bool:
+    """Return whether a file is there, or its compressed form."""
     return (folder / name).exists() or (folder / f"{name}.gz").exists()
 
 
@@ -303,14 +320,3 @@ def _exchange(a: Path, b: Path) -> bool:
     except (OSError, AttributeError):
         return False
     return call(_HERE, os.fsencode(a), _HERE, os.fsencode(b), _EXCHANGE) == 0
-
-
-def patch_entry(patches: Iterable[str], name: str) -> str | None:
-    """Return the key of a patch in a field: its name, else the last pattern in quotes that fits it."""
-    known = list(patches)
-    if name in known:
-        return name
-    for key in reversed(known):
-        if key.startswith('"') and re.fullmatch(key.strip('"'), name):
-            return key
-    return None

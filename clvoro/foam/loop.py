@@ -35,7 +35,7 @@ from ..sizing import Estimate, combine, force_weight, hessian_size, normalize, s
 from .case import FoamCase, Time, check_solver
 from .fields import FoamField, Values
 from .mesh import FoamMesh
-from .transfer import MeshOfCase, check_fluxes, fields_that_move, transfer_fields
+from .transfer import MeshOfCase, check_fluxes, entries_at, fields_that_move, transfer_fields
 
 _MESH, _NOTE = "clvoro.npz", "clvoro.json"
 """Files beside those of a polyMesh: the generators, and what is known of the cycle."""
@@ -262,6 +262,7 @@ class _Loop:
         on_cycle: Callable[[FoamCycle], object],
     ) -> list[FoamCycle]:
         case = self.case
+        case.check_kind()
         case.mend()
         note = self._note(case.latest())
         self.rows = _read_report(case.own / "report.csv")[: note["cycle"] + 1]
@@ -398,6 +399,7 @@ class _Loop:
         points = old.diagram.points
         made = self.adapter.run(domain, size, self.effort, points=points, n_cells=self.n_cells, layers=layers)
         mesh_seconds = time.perf_counter() - start
+        zones = old.zones_on(made.diagram)
         make_folder(case.own)
         target = case.own / f"next-{latest.name}"
         shutil.rmtree(target, ignore_errors=True)
@@ -407,7 +409,8 @@ class _Loop:
             shutil.copytree(case.folder / latest.name / "uniform", target / "uniform")
         if why := rejection(made.solver_mesh()):
             warn(why, MismatchWarning)
-        made.to_openfoam(target / "polyMesh", types=types, thickness=foam.thickness, check=False)
+        made.to_openfoam(target / "polyMesh", types=types, thickness=foam.thickness, zones=zones, check=False)
+        foam.keep_groups(target / "polyMesh" / "boundary")
         made.save(target / "polyMesh" / _MESH)
         new = MeshOfCase.of(FoamMesh.read(target / "polyMesh"), made.diagram)
         start = time.perf_counter()
@@ -436,6 +439,7 @@ class _Loop:
         moving = {one.name for one in fields_that_move(fields, foam.patches)}
         dropped = [f"{one.name} ({one.kind})" for one in fields if one.name not in moving]
         dropped += [f"{name}/" for name in self.case.folders(time)]
+        dropped += [f"{name} (a zone of faces or points)" for name in foam.lost_zones]
         if dropped:
             warn(
                 f"the latest time of {self.case.folder} has {', '.join(dropped)}: not transferred, since only fields "
@@ -552,6 +556,9 @@ def _check_values(fields: Sequence[FoamField], foam: FoamMesh) -> None:
                 f"{one.name} is not finite in {int(bad.sum())} cells, the first is {int(bad.argmax())}; the solver has "
                 "diverged: go back to an earlier time"
             )
+        for patch in foam.patches:
+            if patch.kind != "empty" and len(patch.faces):
+                entries_at(one, patch)
         for name, entries in one.patches.items():
             for key, given in entries.items():
                 if isinstance(given, Values) and not np.isfinite(given.numbers).all():

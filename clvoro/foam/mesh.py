@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import re
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from ..geometry.solid.solid import Solid
 from ..io.arrays import FileError, explained
 from ..io.foam_read import FoamFile, FoamPatchFaces, count_cells
 from ..mesh.geometry import cell_geometry, face_geometry
+from .case import has_file
 
 
 @dataclass(frozen=True)
@@ -33,6 +35,10 @@ class FoamMesh:
         Name, kind, and faces of each part of the boundary.
     n_cells : int
         Number of cells.
+    zones : dict of str to (k,) int64
+        Cells of each zone of cells.
+    lost_zones : tuple of str
+        Zones of faces and of points.
     """
 
     points: np.ndarray
@@ -42,6 +48,8 @@ class FoamMesh:
     neighbor: np.ndarray
     patches: list[FoamPatchFaces]
     n_cells: int
+    zones: dict[str, np.ndarray] = field(default_factory=dict)
+    lost_zones: tuple[str, ...] = ()
 
     @classmethod
     def read(cls, folder: Path) -> FoamMesh:
@@ -71,7 +79,11 @@ class FoamMesh:
             twice = [name for name in names if names.count(name) > 1]
             if twice:
                 raise FileError(f"it has two patches {twice[0]}, expected one for each name")
-            return cls(points, starts, corners, owner, neighbor, patches, n_cells)
+            zones = _zones(folder, "cellZones")
+            if any(not ((rows >= 0) & (rows < n_cells)).all() for rows in zones.values()):
+                raise FileError(f"its zones have cells beyond {n_cells}, expected those of the mesh")
+            lost = (*_zones(folder, "faceZones"), *_zones(folder, "pointZones"))
+            return cls(points, starts, corners, owner, neighbor, patches, n_cells, zones, lost)
 
     @cached_property
     def faces(self) -> tuple[np.ndarray, np.ndarray]:
@@ -112,6 +124,15 @@ class FoamMesh:
     def types(self) -> dict[str, str]:
         """Types of the patches with faces, without those of the layer and of seams."""
         return {patch.name: patch.kind for patch in self.patches if patch.kind not in ("empty", "cyclic")}
+
+    def keep_groups(self, boundary: Path) -> None:
+        """Write the groups of the patches into the file `boundary` of another mesh with the same patches."""
+        text = boundary.read_text()
+        for patch in self.patches:
+            if patch.groups:
+                entry = f"inGroups {len(patch.groups)}({' '.join(patch.groups)});"
+                text = re.sub(rf"(?m)^(\s*{re.escape(patch.name)}\s*\{{)", rf"\1\n        {entry}", text)
+        boundary.write_text(text)
 
     def domain(self) -> Domain:
         """Return the inside of the boundary: a polygon, or a solid. Boundaries have the names of the patches.
@@ -163,6 +184,13 @@ class FoamMesh:
                 groups += [k] * len(fan)
         used, rows = np.unique(np.concatenate(triangles), return_inverse=True)
         return Solid(self.points[used], rows.reshape(-1, 3), groups, [patch.name for patch in self.patches])
+
+
+def _zones(folder: Path, name: str) -> dict[str, np.ndarray]:
+    """Return the zones with cells, faces or points of a file that need not be there."""
+    if not has_file(folder, name):
+        return {}
+    return {zone: rows for zone, rows in FoamFile.read(folder, name).zones().items() if len(rows)}
 
 
 def polygon_of_edges(points: np.ndarray, ends: np.ndarray, names: list[str]) -> Polygon:

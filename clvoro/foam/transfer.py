@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
@@ -9,10 +10,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 import scipy
 
+from ..errors import InputError
 from ..geometry.box import Box
 from ..mesh.diagram import Diagram
 from ..remapping.cell_data import conserved
-from .case import patch_entry
 from .fields import WIDTHS, Entries, FoamField, Values
 from .fluxes import check_balance, project_fluxes
 from .mesh import FoamMesh
@@ -70,6 +71,50 @@ class MeshOfCase:
             )[1]
             means[empty] = values[nearest]
         return means
+
+    def zones_on(self, new: Diagram) -> dict[str, np.ndarray]:
+        """Return the zones of cells on a new diagram, one bool per cell each, by name: those of the nearest old cells.
+
+        Regions of the domain are left out, since the new mesh has them by itself.
+
+        Raises
+        ------
+        InputError
+            If a zone has none of the new cells.
+        """
+        known = () if new.domain.borders is None else new.region_names
+        zones = {name: rows for name, rows in self.foam.zones.items() if name not in known}
+        if not zones:
+            return {}
+        nearest = scipy.spatial.KDTree(self.foam.centroids[:, : new.domain.dim]).query(new.points)[1]
+        made = {name: np.isin(nearest, rows) for name, rows in zones.items()}
+        for name, inside in made.items():
+            if not inside.any():
+                raise InputError(
+                    f"the zone {name} has none of the new cells, expected some; give more cells, or a smaller h_max"
+                )
+        return made
+
+
+def entries_at(field: FoamField, patch: FoamPatchFaces) -> Entries:
+    """Return the entries of a field at a patch: of its name, else of a group, else of the last pattern that fits it.
+
+    Raises
+    ------
+    InputError
+        If there are none.
+    """
+    # Walls are in the group "wall", and so are other types in theirs.
+    for name in (patch.name, *patch.groups, patch.kind):
+        if name in field.patches:
+            return field.patches[name]
+    for key in reversed(field.patches):
+        if key.startswith('"') and re.fullmatch(key.strip('"'), patch.name):
+            return field.patches[key]
+    raise InputError(
+        f"the field {field.name} has no entry for the patch {patch.name} in its boundaryField, expected one; run the "
+        "solver first, which writes one for each patch"
+    )
 
 
 def fields_that_move(fields: Sequence[FoamField], patches: Sequence[FoamPatchFaces]) -> list[FoamField]:
@@ -131,12 +176,11 @@ def _with_boundary(field: FoamField, internal: Values, old: FoamMesh, new: FoamM
     boundary: Entries = {}
     before = {patch.name: patch.faces for patch in old.patches}
     for patch in new.patches:
-        key = patch_entry(field.patches, patch.name)
-        if patch.kind == "empty" or key is None:
-            boundary[patch.name] = {"type": b"empty" if patch.kind == "empty" else b"zeroGradient"}
+        if patch.kind == "empty":
+            boundary[patch.name] = {"type": b"empty"}
             continue
         faces = before.get(patch.name, np.zeros(0, int))
-        boundary[patch.name] = _on_patch(field.patches[key], faces, patch.faces, old, new)
+        boundary[patch.name] = _on_patch(entries_at(field, patch), faces, patch.faces, old, new)
     return {**field.entries, "internalField": internal, "boundaryField": boundary}
 
 
@@ -225,8 +269,7 @@ def _at_boundary(velocity: FoamField, mesh: FoamMesh) -> tuple[np.ndarray, np.nd
     areas = mesh.faces[1]
     for patch in mesh.patches:
         rows = patch.faces - inner
-        key = patch_entry(velocity.patches, patch.name)
-        entries: Entries = {} if key is None else velocity.patches[key]
+        entries = entries_at(velocity, patch)
         kind = entries.get("type", b"")
         name = kind.decode() if isinstance(kind, bytes) else ""
         value = entries.get("value")

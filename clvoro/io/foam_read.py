@@ -24,6 +24,7 @@ from .foam import polymesh_folder
 _HEAD = re.compile(rb"FoamFile\s*\{(.*?)\}", re.DOTALL)
 _COMMENTS = re.compile(rb"/\*.*?\*/|//[^\n]*", re.DOTALL)
 _LIST = re.compile(rb"\s*(\d+)\s*\(?")
+_ZONE = re.compile(rb'"?([^\s"{}()]+)"?\s*\{[^{}()]*?Labels\s+List<label>\s*(\d+)\s*')
 _PATCH = re.compile(r'"?([^\s"{}()]+)"?\s*\{([^{}]*)\}')
 
 
@@ -164,12 +165,13 @@ def read_with_head(path: Path) -> tuple[dict[str, str], bytes, int]:
 
 @dataclass(frozen=True)
 class FoamPatchFaces:
-    """A part of the boundary: name, type, the patch across a seam, and its faces, (k,)."""
+    """A part of the boundary: name, type, the patch across a seam, its faces, (k,), and the groups that it is in."""
 
     name: str
     kind: str
     across: str
     faces: np.ndarray
+    groups: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -261,7 +263,27 @@ class FoamFile:
             entries = dict(re.findall(r"(\w+)\s+([^;]+);", body))
             first, count = int(entries["startFace"]), int(entries["nFaces"])
             across = entries.get("neighbourPatch", "").strip()
-            made.append(FoamPatchFaces(name, entries["type"].strip(), across, np.arange(first, first + count)))
+            groups = tuple(re.findall(r"[^\s()\"]+", entries.get("inGroups", "").partition("(")[2]))
+            faces = np.arange(first, first + count)
+            made.append(FoamPatchFaces(name, entries["type"].strip(), across, faces, groups))
+        return made
+
+    def zones(self) -> dict[str, np.ndarray]:
+        """Return the labels of the cells, faces or points of each zone, (k,), by name."""
+        made, at = {}, 0
+        while found := _ZONE.search(self.body, at):
+            count, at = int(found[2]), found.end()
+            begins = self.body[at : at + 1]
+            if begins == b"(" and self._is_binary():
+                rows, at = self._binary(self._label, 1, found.start(2))
+            elif begins == b"(":
+                end = self.body.find(b")", at)
+                rows, at = np.array(self.body[at + 1 : end].split(), np.int64), end
+            else:  # one label for all, or none
+                rows = np.repeat(np.array(self.body[at + 1 : self.body.find(b"}", at)].split()[:1], np.int64), count)
+            if len(rows) != count:
+                raise FileError(f"a zone has {len(rows)} labels, expected {count}")
+            made[found[1].decode("utf-8", "replace")] = rows.astype(np.int64)
         return made
 
 

@@ -353,6 +353,15 @@ def change_field(case, name, change, key="internalField", patch=None, time="5"):
     replace(field, entries=entries).write(case / time / name, time)
 
 
+def put_zones(case, **zones):
+    """Write a zone of each kind: cells, faces or points, in text."""
+    for kind, rows in zones.items():
+        labels = f"{kind}Labels List<label> {len(rows)}({' '.join(map(str, rows))})"
+        text = f"1\n(\nporous\n{{\n    type {kind}Zone;\n    {labels};\n}}\n)\n"
+        head = "FoamFile { format ascii; class regIOobject; }\n"
+        (case / "constant" / "polyMesh" / f"{kind}Zones").write_text(head + text)
+
+
 def close(case, patch):
     """Give the velocity at a patch, 0."""
     field = foam.read_field(case / "5" / "U")
@@ -385,6 +394,15 @@ def nan_in_row_3(values):
         (lambda c: shutil.rmtree(c / "system"), {}, InputError, "no system/controlDict"),
         (lambda c: shutil.rmtree(c / "5"), {}, InputError, "run the solver first"),
         (lambda c: (c / "processor0").mkdir(), {}, InputError, "reconstructPar"),
+        (lambda c: (c / "constant/regionProperties").touch(), {}, InputError, "expected a case with one mesh"),
+        (
+            lambda c: (c / "constant/dynamicMeshDict").write_text("dynamicFvMesh dynamicRefineFvMesh;\n"),
+            {},
+            InputError,
+            "dynamicRefineFvMesh, expected staticFvMesh",
+        ),
+        (lambda c: spoil(c, "5/p", b"outlet", b"exit"), {}, InputError, "p has no entry for the patch outlet .*run"),
+        (lambda c: put_zones(c, cell=[400]), {}, InputError, "zones have cells beyond"),
         (lambda c: shutil.rmtree(c / "constant"), {}, InputError, "no mesh"),
         (lambda c: None, {"sizes": foam.FieldSizes(["T"])}, InputError, "no field T"),
         (lambda c: None, {"sizes": foam.FieldSizes(["k"])}, InputError, "k has one value .*run the solver"),
@@ -485,6 +503,40 @@ def test_fields_that_are_lost_are_named(case):
         with pytest.raises(InputError, match="no field T"):
             foam.adapt_case(case, n_cells=300, sizes=foam.FieldSizes(["T"]))
     assert content(case) == before
+
+
+def test_zones_and_groups_follow(case):
+    """The cells of a zone, and the groups of patches, which conditions may name; other zones are lost."""
+    before = FoamMesh.read(case / "constant" / "polyMesh")
+    inside = np.flatnonzero(before.centroids[:, 0] > 2)
+    put_zones(case, cell=inside, face=[0, 1])
+    spoil(case, "constant/polyMesh/boundary", b"type            patch", b"inGroups 2(ends way); type            patch")
+    name = next(patch.name for patch in FoamMesh.read(case / "constant" / "polyMesh").patches if patch.groups)
+    spoil(case, "5/p", name.encode(), b"ends")
+    with pytest.warns(LostFieldsWarning, match="porous .a zone of faces"):
+        foam.adapt_case(case, n_cells=300, effort="fast", pictures=False)
+    after = FoamMesh.read(case / "5" / "polyMesh")
+    assert {patch.name: patch.groups for patch in after.patches if patch.groups} == {name: ("ends", "way")}
+    assert after.lost_zones == ()
+    zone = np.isin(np.arange(after.n_cells), after.zones["porous"])
+    x = after.centroids[:, 0]
+    assert zone[x > 2.2].all()
+    assert not zone[x < 1.8].any()
+    put_zones(case, cell=[0])
+    shutil.copy(case / "constant" / "polyMesh" / "cellZones", case / "5" / "polyMesh")
+    with pytest.raises(InputError, match="the zone porous has none of the new cells"):
+        foam.adapt_case(case, n_cells=20, effort="fast", pictures=False)
+
+
+@pytest.mark.parametrize("binary", [False, True])
+def test_zones_are_read(tmp_path, binary):
+    """With many labels, one label for all, and none."""
+    form, rows = ("binary", np.arange(5, dtype=np.int32).tobytes()) if binary else ("ascii", b"0 1 2 3 4")
+    text = b"FoamFile { format %b; class regIOobject; }\n3\n(\na { type cellZone; cellLabels List<label> \n5\n(%b); }\n"
+    text += b"b { type cellZone; cellLabels List<label> 3{7}; }\nc { type cellZone; cellLabels List<label> 0(); }\n)\n"
+    (tmp_path / "cellZones").write_bytes(text % (form.encode(), rows))
+    found = foam_read.FoamFile.read(tmp_path, "cellZones").zones()
+    assert {name: labels.tolist() for name, labels in found.items()} == {"a": [0, 1, 2, 3, 4], "b": [7, 7, 7], "c": []}
 
 
 def test_the_command(case, capsys):
