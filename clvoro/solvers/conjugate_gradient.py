@@ -95,10 +95,11 @@ class ConjugateGradient:
             self._record_capacity = limits.max_iterations
             self.record = self.engine.zeros(4 * (limits.max_iterations + 2))
             self._group_state = self.engine.zeros(_STATE + 4 * (limits.max_iterations + 1))
-        if operator.rows is not None and isinstance(precondition, cla.Array):
-            if len(rhs) <= self._one_group_limit:
-                return self._solve_by_group(operator, rhs, x, precondition, limits, from_zero, store)
-        system = _Iteration(self, operator, rhs, x, precondition, limits.tolerance, store)
+        jacobi = isinstance(precondition, cla.Array)
+        inverse, function = (precondition, None) if jacobi else (None, precondition)
+        if operator.rows is not None and inverse is not None and len(rhs) <= self._one_group_limit:
+            return self._solve_by_group(operator, rhs, x, inverse, limits, from_zero, store)
+        system = _Iteration(self, operator, rhs, x, inverse, function, limits.tolerance, store)
         iterations, history, reason = 0, [], "max_iterations"
         # From zero the relative residual is 1; the host reads the norm of b with the first iterations.
         begun = from_zero and 0 < limits.max_iterations and limits.tolerance < 1
@@ -266,7 +267,7 @@ class ConjugateGradient:
 
 
 class _Iteration:
-    """One linear system with the vectors and launches of its iteration."""
+    """One linear system with the vectors and launches of its iteration; `inverse` is that of the diagonal, or None."""
 
     def __init__(
         self,
@@ -274,12 +275,13 @@ class _Iteration:
         operator: Operator,
         rhs: cla.Array,
         x: cla.Array,
-        precondition: cla.Array | Precondition,
+        inverse: cla.Array | None,
+        precondition: Precondition | None,
         tolerance: float,
         store: np.dtype,
     ) -> None:
         self._solver, self._engine, n = solver, solver.engine, len(rhs)
-        self._operator, self._precondition = operator, precondition
+        self._operator, self._inverse, self._precondition = operator, inverse, precondition
         self._rhs, self._x = rhs, x
         self._kernels = k = solver.kernels_in(store)
         scratch = self._engine.scratch
@@ -291,7 +293,7 @@ class _Iteration:
         # On CPUs it costs more to evaluate directions of neighbors again than to store them.
         self._merged = operator.rows is not None and self._engine.group_size > 1
         directions = (self._p, scratch(n, store)) if self._merged else (self._p, self._p)
-        self._sums = (_NORM_R, _SUM_R, _GAMMA) if isinstance(precondition, cla.Array) else (_NORM_R, _SUM_R)
+        self._sums = (_NORM_R, _SUM_R) if inverse is None else (_NORM_R, _SUM_R, _GAMMA)
         self._size, self._center = np.int32(n), np.int32(all_n if operator.singular else 0)
         # The recurrence stops slightly below the tolerance, so that the true residual is within it.
         limit = self._engine.real.type(self._tolerance)
@@ -306,10 +308,10 @@ class _Iteration:
                 direction = k.update_direction, first, np.int32(rows), limit, self._u, p
             self._find_direction.append(Launch(self._engine, *direction, *self._tail))
             vectors = p, self._q, x, self._r
-            if isinstance(precondition, cla.Array):
-                solution = (k.update_solution_jacobi, first, self._size, self._center, precondition, *vectors, self._u)
-            else:
+            if inverse is None:
                 solution = k.update_solution, first, self._size, self._center, *vectors
+            else:
+                solution = k.update_solution_jacobi, first, self._size, self._center, inverse, *vectors, self._u
             self._update_solution.append(Launch(self._engine, *solution, *self._tail))
 
     def measure(self, from_zero: bool = False) -> float:
@@ -352,10 +354,8 @@ class _Iteration:
 
     def begin(self) -> None:
         """Precondition the first residual."""
-        if isinstance(self._precondition, cla.Array):
-            self._launch(
-                self._kernels.precondition_jacobi, self._size, self._precondition, self._r, self._u, self._tail[0]
-            )
+        if self._inverse is not None:
+            self._launch(self._kernels.precondition_jacobi, self._size, self._inverse, self._r, self._u, self._tail[0])
             self._sum(_GAMMA, of=self._u)
 
     def iterate(self, k: int) -> bool:
@@ -363,7 +363,7 @@ class _Iteration:
 
         It is known where there are other parts, and then not by the last digits.
         """
-        if not isinstance(self._precondition, cla.Array):
+        if self._precondition is not None:
             self._precondition(self._r, self._u[: len(self._r)], self._q)
             self._dot_product(_GAMMA + (k & 1), self._r, self._u)
             self._sum(_GAMMA + (k & 1), of=self._u)
