@@ -6,8 +6,11 @@
 For each number of ranks the script starts itself under `mpiexec`; with PoCL each rank has one core. `bits` says whether
 the diagram of random points has the same bits as with the first number of ranks. The other columns are of a run in a
 box with sizes from h to 3 h, after a run of fewer cells, which builds kernels. `CPU s` is its processor time, summed
-over ranks, and `over one` the ratio to that of the first number of ranks. `exchanges` and `reductions` are the rounds
-of messages between pairs of ranks, and of sums over all ranks, per step. `ghosts` is the number of ghosts of rank 0 in
+over ranks, and `over one` the ratio to that of the first number of ranks. `floor` is the same ratio for as many
+processes that each make their share of the cells alone, at the same time and without messages: what fixed work per
+step, and cores and caches that processes share, cost anyway. `exchanges` and `reductions` are the rounds of messages
+between pairs of ranks, and of sums over all ranks, per step. Some of both take place at the same time; `waits` counts
+how often a rank waits for others. `ghosts` is the number of ghosts of rank 0 in
 the last diagram over 2 d (n / p)^((d - 1) / d), an estimate of one layer of cells around a part. `one round` is the
 share of diagrams whose cells were made once, since no ghosts were missing, and `asked` how often ranks asked each other
 for ghosts, over the number of diagrams. Needs `pip install -e '.[mpi]'`.
@@ -35,9 +38,11 @@ COLUMNS = {
     "mean Q": shown("quality", ".4f"),
     "CPU s": shown("cpu", ".1f"),
     "over one": shown("over_one", ".2f"),
+    "floor": shown("floor", ".2f"),
     "iterations": shown("iterations", ".1f"),
     "exchanges": shown("exchanges", ".0f"),
     "reductions": shown("reductions", ".0f"),
+    "waits": shown("waits", ".0f"),
     "ghosts": shown("ghosts", ".2f"),
     "one round": shown("one_round", ".0%"),
     "asked": shown("asked", ".0%"),
@@ -70,12 +75,21 @@ def measure_rank(options: argparse.Namespace) -> None:
         digest.update(np.ascontiguousarray(getattr(whole, name)))
     factor = {2: 2 / 3, 3: (13 / 27) ** 0.5}[dim]
     h = factor * cells ** (-1 / dim)
-    adapter.run(box, lambda p: 4 * h * (1 + 2 * p[:, 0]), effort)  # builds kernels
+
+    def run(by: clvoro.Adapter, h: float) -> tuple[clvoro.Result, float]:
+        comm.Barrier()
+        began = time.process_time()
+        mesh = by.run(box, lambda p: h * (1 + 2 * p[:, 0]), effort)
+        return mesh, comm.allreduce(time.process_time() - began)
+
+    run(adapter, 4 * h)  # builds kernels
+    single = clvoro.Adapter(adapter.ctx, options.dtype, comm=MPI.COMM_SELF)
+    run(single, 4 * h)
+    _, least = run(single, h * comm.size ** (1 / dim))
     rounds.clear()
-    asked[0] = 0
-    began, calls = time.process_time(), (adapter._peers.exchanges, adapter._peers.reductions)
-    mesh = adapter.run(box, lambda p: h * (1 + 2 * p[:, 0]), effort)
-    spent = comm.allreduce(time.process_time() - began)
+    asked[0], peers = 0, adapter._peers
+    calls = peers.exchanges, peers.reductions, peers.waits
+    mesh, spent = run(adapter, h)
     steps = int(mesh.history["step"][-1])
     per_part = mesh.history["cells"][-1] / comm.size
     layer = 2 * dim * per_part ** ((dim - 1) / dim)
@@ -88,9 +102,11 @@ def measure_rank(options: argparse.Namespace) -> None:
             "error": float(last["mean_error"]),
             "quality": float(last["mean_quality"]),
             "cpu": spent,
+            "least": least,
             "iterations": float(mesh.history["iterations"].sum() / steps),
-            "exchanges": (adapter._peers.exchanges - calls[0]) / steps,
-            "reductions": (adapter._peers.reductions - calls[1]) / steps,
+            "exchanges": (peers.exchanges - calls[0]) / steps,
+            "reductions": (peers.reductions - calls[1]) / steps,
+            "waits": (peers.waits - calls[2]) / steps,
             "ghosts": ghosts[0] / layer,
             "one_round": float(np.mean(np.array(rounds) == 1)) if comm.size > 1 else 1.0,
             "asked": asked[0] / len(rounds) if comm.size > 1 else 0.0,
@@ -117,7 +133,8 @@ def main() -> None:
             record = json.loads(found.stdout.splitlines()[-1])
             first = first or record
             bits = "same" if record["digest"] == first["digest"] else "differ"
-            table.add(record | {"bits": bits, "over_one": record["cpu"] / first["cpu"]})
+            ratios = {"over_one": record["cpu"] / first["cpu"], "floor": record["least"] / first["least"]}
+            table.add(record | {"bits": bits, **ratios})
         table.finish(f"Ranks in {dim}D, effort {options.effort}")
 
 

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
 Made = TypeVar("Made")
-PATIENCE, NAPS = 10, (1e-4, 2e-3)
+PATIENCE, NAPS = 5, (1e-4, 2e-3)
 """A rank that waits for a message first asks for it `PATIENCE` times without a pause. Then it sleeps before each
 question, since there may be more ranks than cores: for as long as it has waited so far, within the limits `NAPS` in
 seconds. To fall asleep and to wake up takes some 30 microseconds of processor time."""
@@ -44,12 +44,12 @@ class Peers:
         permanent numbers of its neighbors.
     gathers : bool
         Whether this part gathers the mesh of all parts at the end of each run.
-    exchanges, reductions : int
-        Calls of `exchange` and of `gather` so far.
+    exchanges, reductions, waits : int
+        Calls of `exchange` and of `gather` so far, with what `swap` does of both, and how often this part has waited.
     """
 
     number, count, shared, gathers = 0, 1, False, False
-    exchanges = reductions = 0
+    exchanges = reductions = waits = 0
 
     def exchange(self, sent: Sequence[np.ndarray], sizes: ArrayLike | None = None) -> list[np.ndarray]:
         """Send array k to part k, and return what each part has sent to this one, in the order of parts.
@@ -191,7 +191,7 @@ class Ranks(Peers):
         self.exchanges += 1
         own, found = sent[self.number], np.empty(self.count, np.int64)
         if sizes is None:
-            self._complete(self._comm.Ialltoall(np.array([len(values) for values in sent], np.int64), found))
+            self._complete([self._comm.Ialltoall(np.array([len(values) for values in sent], np.int64), found)])
         else:
             found[:] = sizes
         received = [np.empty((int(size), *own.shape[1:]), own.dtype) for size in found]
@@ -200,7 +200,7 @@ class Ranks(Peers):
         requests = [self._comm.Irecv(_bytes(received[part]), part) for part in others if found[part]]
         packed = {part: np.ascontiguousarray(sent[part]) for part in others if len(sent[part])}
         requests += [self._comm.Isend(_bytes(values), part) for part, values in packed.items()]
-        self._complete(*requests)
+        self._complete(requests)
         return received
 
     def swap(
@@ -223,13 +223,13 @@ class Ranks(Peers):
                 if size
             ]
         found, more = ([], []) if values is None else self._begin_gather(values)
-        self._complete(*requests, *more)
+        self._complete(requests + more)
         return list(found)
 
     def gather(self, values: np.ndarray) -> list[np.ndarray]:
         """Collect one array of each rank on all of them."""
         found, requests = self._begin_gather(values)
-        self._complete(*requests)
+        self._complete(requests)
         return list(found)
 
     def _begin_gather(self, values: np.ndarray) -> tuple[np.ndarray, list[Any]]:
@@ -245,12 +245,13 @@ class Ranks(Peers):
         requests = [self._comm.Irecv(rows[part], part) for part in others]
         return found, requests + [self._comm.Isend(own, part) for part in others]
 
-    def _complete(self, *requests: Any) -> None:
+    def _complete(self, requests: list[Any]) -> None:
         """Wait for `requests`, unless a rank fails."""
         if self._failed:
             raise RankError(self._failed)
-        left, turns, began, waited = list(requests), 0, time.perf_counter(), 0.0
-        while left := [request for request in left if not request.Test()]:
+        self.waits += 1
+        turns, began, waited = 0, time.perf_counter(), 0.0
+        while requests and not requests[0].Testall(requests):
             turns += 1
             if turns > PATIENCE:
                 if self._alarms.Iprobe(tag=ALARM):
