@@ -18,6 +18,7 @@ area of `left_out` over that of the domain.
 
 from __future__ import annotations
 
+import itertools
 import shutil
 import sys
 import tempfile
@@ -27,9 +28,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import contourpy
 import numpy as np
 import scipy.ndimage
 import shapely
+import shapely.affinity
 from _common import Report, heading, make_adapter, names, parser, seeds_of
 
 import clvoro
@@ -126,11 +129,61 @@ def chart(rng: np.random.Generator) -> clvoro.Polygon:
     return clvoro.Polygon(rings[0], rings[1:])
 
 
-MASKS = {"blobs": _blobs, "checkers": _checkers, "shores": _shores, "noise": _noise}
+def _rivers(rng: np.random.Generator) -> np.ndarray:
+    """Return land around a river that winds from side to side, and two that flow into it."""
+    main = np.column_stack([np.linspace(0, PIXELS, 9), rng.uniform(3, PIXELS - 3, 9)])
+    courses = [main, *([rng.uniform(0, PIXELS, 2), rng.uniform(0, PIXELS, 2), main[k]] for k in (3, 6))]
+    lines = shapely.MultiLineString([shapely.LineString(course) for course in courses])
+    y, x = np.indices((PIXELS, PIXELS)).reshape(2, -1)
+    land = shapely.distance(lines, shapely.points(x, y)) > rng.uniform(0.5, 1.2)
+    return np.pad(land.reshape(PIXELS, PIXELS), 1, constant_values=True)
+
+
+def buildings(rng: np.random.Generator) -> clvoro.Polygon:
+    """Return the space between buildings, turned rectangles and angles of which some touch or nearly do."""
+    houses = []
+    for x, y in np.argwhere(np.ones((5, 5))) * 5.0:
+        long, wide = rng.uniform(2, 5.2, 2)
+        house = shapely.box(0, 0, long, wide)
+        if rng.random() < 0.4:
+            house = house.difference(shapely.box(long * rng.uniform(0.3, 0.7), wide * rng.uniform(0.3, 0.7), 6, 6))
+        turned = shapely.affinity.rotate(house, rng.choice([0, rng.uniform(0, 90)]))
+        houses.append(shapely.affinity.translate(turned, x, y))
+    air = shapely.box(-3, -3, 29, 29).difference(shapely.union_all(houses))
+    return clvoro.Polygon.from_shapely(max(shapely.get_parts(air), key=lambda part: part.area))
+
+
+def contours(rng: np.random.Generator) -> clvoro.Polygon:
+    """Return the largest part between two levels of a smooth random field, by marching squares."""
+    field = np.pad(scipy.ndimage.zoom(_field(rng, 2), 1.0), 1, constant_values=-9)
+    lines, codes = contourpy.contour_generator(z=field, fill_type="OuterOffset").filled(rng.uniform(-0.6, -0.2), 2.0)
+    parts = []
+    for points, starts in zip(lines, codes, strict=True):
+        rings = [points[a:b] for a, b in itertools.pairwise(starts)]
+        parts.append(shapely.Polygon(rings[0], rings[1:]))
+    return clvoro.Polygon.from_shapely(max(parts, key=lambda part: part.area))
+
+
+def archipelago(rng: np.random.Generator) -> clvoro.Polygon:
+    """Return a sea with 60 islands, triangles to octagons, of which some overlap, touch or nearly do."""
+    islands = []
+    for _ in range(60):
+        turn = np.sort(rng.uniform(0, 2 * np.pi, rng.integers(4, 9)))
+        r = 10 ** rng.uniform(-0.7, 0.5, 2)
+        ring = rng.uniform(2, 30, 2) + r * np.column_stack([np.cos(turn), np.sin(turn)])
+        islands.append(shapely.Polygon(np.round(ring, int(rng.integers(0, 3)))).buffer(0))
+    sea = shapely.remove_repeated_points(shapely.box(0, 0, 32, 32).difference(shapely.union_all(islands)), 1e-9)
+    return clvoro.Polygon.from_shapely(max(shapely.get_parts(sea), key=lambda part: part.area))
+
+
+MASKS = {"blobs": _blobs, "checkers": _checkers, "shores": _shores, "noise": _noise, "rivers": _rivers}
 KINDS: dict[str, Callable[[np.random.Generator], clvoro.Polygon]] = {
     **{name: lambda rng, make=make: _water(make(rng)) for name, make in MASKS.items()},
     "coasts": coast,
     "charts": chart,
+    "buildings": buildings,
+    "contours": contours,
+    "archipelagos": archipelago,
 }
 MEANS = ["boundary_mean_error", "inner_mean_error", "boundary_mean_quality", "inner_mean_quality", "min_quality"]
 

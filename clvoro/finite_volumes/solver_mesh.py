@@ -15,7 +15,7 @@ from ..mesh.faces import Faces
 from .seams import faces_with_seams
 
 _ROUNDS = 8
-"""How often a mesh with straight walls is made, until OpenFOAM accepts it."""
+"""How often rejected cells are tried to be made better."""
 _LARGE_CHANGE = 0.01
 """Change of the domain's area, as a share of it, beyond which there is a warning."""
 
@@ -72,30 +72,24 @@ def _made(diagram: Diagram, walls: WallShape, collapse: bool, parts: np.ndarray)
 
 
 def _in_polygon(diagram: Diagram, outline: Polygon, parts: np.ndarray, collapse: bool) -> Faces:
-    """Return the mesh with straight walls: made again with simpler cells where OpenFOAM would reject it."""
-    from .dead_ends import open_dead_ends
+    """Return the mesh with straight walls: cells divided anew where OpenFOAM would reject them."""
     from .gate import rejected_polygons
+    from .redivision import redivide
     from .relaxation import relax_bad_faces
     from .short_edges import collapse_short_edges
-    from .walls import simplify, straight_walls
+    from .walls import straight_walls
 
-    kinds = np.zeros(len(diagram), np.int64)
-    best: tuple[int, Faces] | None = None
+    mesh = straight_walls(diagram, outline, parts)
+    if not collapse:
+        return mesh.compact()
+    mesh = collapse_short_edges(mesh, parts).compact()
+    rejected = np.zeros(mesh.n_cells, bool)
     for _ in range(_ROUNDS):
-        mesh = straight_walls(diagram, outline, parts, kinds)
-        if not collapse:
-            return mesh.compact()
-        mesh = open_dead_ends(collapse_short_edges(mesh, parts).compact(), parts)
-        mesh = relax_bad_faces(mesh, parts)
+        mesh = relax_bad_faces(redivide(mesh, parts, rejected), parts)
         rejected = rejected_polygons(mesh)
-        count = int(np.count_nonzero(rejected))
-        if best is None or count < best[0]:
-            best = (count, mesh)
-        if not count:
+        if not rejected.any():
             break
-        simplify(kinds, mesh, rejected)
-    assert best is not None
-    return best[1]
+    return mesh
 
 
 def _collapsed_polygons(mesh: Faces, diagram: Diagram, parts: np.ndarray, collapse: bool) -> Faces:

@@ -48,13 +48,6 @@ CLOSED = 1e-3
 So throats close, of which a determinant of OpenFOAM would vanish, and the mouths of slits."""
 INSIDE, ON, OUTSIDE = 1, 0, -1
 """Places of a vertex."""
-EXACT, PLAIN, FILLED = range(3)
-"""How a cell is made at the boundary: as said above; cut by straight faces alone; not cut where vertices are near."""
-FARTHEST = FILLED + 3
-"""How far a cell is filled grows from `FILLED` to this."""
-REACH, DEPTH, FARTHER = 1.3, 0.4, 1.3
-"""Distances from the generator and from the boundary up to which vertices of filled cells lie inside, over the size;
-their growth."""
 
 
 class RingCoordinate:
@@ -158,7 +151,7 @@ def convex_faces(points: np.ndarray, weights: np.ndarray, extent: float) -> Conv
     return ConvexFaces(left[once], right[once], there[once], here[once], vertices)
 
 
-def straight_walls(diagram: Diagram, domain: Polygon, parts: np.ndarray, kinds: np.ndarray | None = None) -> Faces:
+def straight_walls(diagram: Diagram, domain: Polygon, parts: np.ndarray) -> Faces:
     """Return the mesh for solvers of `diagram` in `domain`; see the head of this module.
 
     Parameters
@@ -168,12 +161,8 @@ def straight_walls(diagram: Diagram, domain: Polygon, parts: np.ndarray, kinds: 
         That of the diagram.
     parts : (k,) int
         Index of the named part of the boundary for each wall. A face on the boundary has walls of one part.
-    kinds : (n,) int, optional
-        From `EXACT` to `FARTHEST`: how each cell is made. Plain cells have one straight face from where they leave the
-        domain to where they enter it, and are convex. Filled ones are plain, and vertices near their generators lie
-        inside, wherever the boundary is.
     """
-    maker = _WallMaker(diagram, domain, parts, np.zeros(len(diagram), int) if kinds is None else kinds)
+    maker = _WallMaker(diagram, domain, parts)
     maker.place_vertices()
     maker.cut_faces()
     maker.name_points()
@@ -209,8 +198,8 @@ class _WallMaker:
         Faces on the boundary: cells, walls, points.
     """
 
-    def __init__(self, diagram: Diagram, domain: Polygon, parts: np.ndarray, kinds: np.ndarray) -> None:
-        self.diagram, self.domain, self.kinds = diagram, domain, kinds
+    def __init__(self, diagram: Diagram, domain: Polygon, parts: np.ndarray) -> None:
+        self.diagram, self.domain = diagram, domain
         self.rings = domain.oriented
         self.generators = diagram.points
         self.along = RingCoordinate(domain)
@@ -222,7 +211,6 @@ class _WallMaker:
         for cell in (f.left, f.right):
             np.minimum.at(width, cell, apart)
         self.width = np.minimum(width[f.left], width[f.right])
-        self.is_plain = np.maximum(kinds[f.left], kinds[f.right]) >= PLAIN
         self.walls = np.empty(0, np.int64), np.empty(0, np.int64), np.empty((0, 2), np.int64)
 
     def place_vertices(self) -> None:
@@ -239,30 +227,6 @@ class _WallMaker:
         near = ((v[used] >= self.domain.lower - reach) & (v[used] <= self.domain.upper + reach)).all(axis=1)
         rows, _ = self.domain.edges_within(v[used[near]], reach[near, 0])
         self.place[used[near][rows]] = ON
-        self._place_again(covered)
-
-    def _place_again(self, covered: np.ndarray) -> None:
-        """Place the vertices of cells that are not exact; those `covered` (k,) by the domain are inside."""
-        f, kinds = self.convex, self.kinds
-        self.filled = np.zeros(len(f.vertices), bool)
-        if not kinds.any():
-            return
-        inside = np.full(len(f.vertices), OUTSIDE)
-        inside[covered] = INSIDE
-        reach = FARTHER ** (kinds - FILLED) * self.size
-        depth = np.full(len(f.vertices), np.inf)
-        around = np.maximum(kinds[f.left], kinds[f.right]) >= FILLED
-        asked = np.unique(np.concatenate([f.begin[around], f.end[around]]))
-        depth[asked] = self.domain.boundary_distance(f.vertices[asked])
-        for cell in (f.left, f.right):
-            for end in (f.begin, f.end):
-                plain = end[kinds[cell] >= PLAIN]
-                self.place[plain] = inside[plain]
-                near = np.hypot(*(f.vertices[end] - self.generators[cell]).T) <= REACH * reach[cell]
-                near &= depth[end] <= DEPTH * reach[cell]
-                self.filled[end[(kinds[cell] >= FILLED) & near]] = True
-        self.place[self.filled] = INSIDE
-        self.filled[covered] = False
 
     def cut_faces(self) -> None:
         """Find the part of each face that is kept."""
@@ -290,9 +254,6 @@ class _WallMaker:
         whole |= ~from_begin & from_end & on[:, 0] & (low[first] <= gap)
         part[whole] = 0, 1, np.nan, np.nan
         self.kept[cut] = seen & (~on.any(axis=1) | (part[:, 1] - part[:, 0] >= gap))
-        # From a filled vertex on land nothing is kept of a face that leads outward.
-        on_land = from_begin & self.filled[f.begin[cut]] | from_end & self.filled[f.end[cut]]
-        self.kept[cut[on_land]] = False
         part[on[:, 0] & (part[:, 0] < margin), 2] = np.nan
         part[on[:, 1] & (part[:, 1] > 1 - margin), 3] = np.nan
         self.crossed[cut] = part[:, 2:]
@@ -398,7 +359,7 @@ class _WallMaker:
         """Move the nearest face end on the boundary into each convex corner and each end of a named part."""
         width = np.full(len(self.points), np.inf)
         for end in self.ends[self.kept].T:
-            np.minimum.at(width, end, np.where(self.is_plain[self.kept], -1.0, self.width[self.kept]))
+            np.minimum.at(width, end, self.width[self.kept])
         on = np.flatnonzero(~np.isnan(self.position))
         turns, begins = self.rings.turns, self.along.begins
         corners = np.flatnonzero((turns > WALL_CORNER) | self.changes_part)
@@ -437,10 +398,8 @@ class _WallMaker:
         after[starts[1:][filled] - 1] = starts[:-1][filled]
         gaps = np.flatnonzero(ends[:, 1] != ends[after, 0])
         cell, gap = cell[gaps], np.column_stack([ends[gaps, 1], ends[after[gaps], 0]])
-        straight = self.kinds[cell] >= PLAIN
-        exact = np.flatnonzero(~straight)
         # Where rings touch, and where a cell touches the boundary, the ends of a gap are on different parts of it.
-        straight[exact[self._close(cell[exact], gap[exact])]] = True
+        straight = self._close(cell, gap)
         walls = self.domain.closest_walls(self.points[gap[straight]].mean(axis=1))
         self._add_walls(cell[straight], walls, gap[straight])
         for c in np.flatnonzero(~filled).tolist():
@@ -560,14 +519,6 @@ class _WallMaker:
             half_face=np.full(count, -1),
         )
         return made.take_faces(ends[:, 0] != ends[:, 1])
-
-
-def simplify(kinds: np.ndarray, mesh: Faces, rejected: np.ndarray) -> None:
-    """Change the `kinds` (n,) of `rejected` cells (n,) bool of `mesh`, and of those around filled ones, in place."""
-    changed, k = rejected.copy(), np.flatnonzero(mesh.neighbor >= 0)
-    stuck, a, b = rejected & (kinds >= FILLED), mesh.owner[k], mesh.neighbor[k]
-    changed[a[stuck[b]]] = changed[b[stuck[a]]] = True
-    kinds[changed] = np.minimum(kinds[changed] + 1, FARTHEST)
 
 
 def _changes(rings: OrientedRings, parts: np.ndarray) -> np.ndarray:

@@ -1,9 +1,11 @@
-"""Cells at dead ends get a second neighbor; faces across channels that are one cell wide are tilted."""
+"""Cells that OpenFOAM would reject are divided anew, together with another cell."""
 
 import numpy as np
 import pytest
+import shapely
 
 import clvoro
+from clvoro.errors import MismatchWarning
 from tests.finite_volumes.test_straight_walls import concave_by, polygons
 
 ROOM = np.array([(0.0, 0), (3, 0), (3, 3), (2, 3), (2, 5.2), (1, 5.2), (1, 3), (0, 3)])
@@ -59,3 +61,25 @@ def test_a_cell_in_a_lagoon_is_accepted(ctx):
     assert mesh.measures.determinant[0] > 1e-2
     assert max(map(concave_by, polygons(mesh))) < 0
     assert diagram.check(solver="openfoam")
+
+
+def test_cells_in_a_throat_and_without_neighbors_take_a_part_of_others(ctx):
+    """One cell lies on both sides of a throat of 1e-8, and two in a slit behind it, which no face leaves."""
+    left, right = 1.5 - 5e-9, 1.5 + 5e-9
+    x, y = np.meshgrid([0.5, 1.5, 2.5], [0.5, 1.5, 2.5])
+    inner = np.column_stack([x.ravel(), y.ravel()]) + np.random.default_rng(2).uniform(-0.05, 0.05, (9, 2))
+    hall = [(left, 4), (0, 3), (0, 0), (3, 0), (3, 3), (right, 4)]
+    slit = [(1.6, 4.1), (1.6, 8), (1.5, 8), (1.5, 4.1)]
+    diagram = clvoro.Adapter(ctx).diagram(
+        clvoro.Polygon(hall + slit), np.concatenate([inner, [(1.5, 4.0), (1.55, 5.5), (1.55, 7.3)]])
+    )
+    with pytest.warns(MismatchWarning):
+        mesh = diagram.solver_mesh()
+    assert diagram.check(solver="openfoam")
+    cells = polygons(mesh)
+    assert len(cells) == 12
+    assert max(map(concave_by, cells)) < 1e-6
+    assert sum(p.area for p in cells) == pytest.approx(10.5, rel=0.1)
+    assert all(p.contains(shapely.Point(x)) for p, x in zip(cells, mesh.generators, strict=True))
+    before = {tuple(x) for x in diagram.points.tolist()}
+    assert 0 < len(before - {tuple(x) for x in mesh.generators.tolist()}) <= 4

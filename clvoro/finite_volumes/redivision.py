@@ -1,0 +1,368 @@
+"""Cells in 2D that OpenFOAM rejects: each is divided anew, together with a neighbor.
+
+The union of both cells is cut by another straight face. Where no cut of a union helps, the place of the cell is left
+out of the mesh, and the cell gets a part of its neighbor. So cells at dead ends and in channels that are one cell wide
+have faces in two directions, and what lies in throats and on needles needs no cells.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from ..mesh.connectivity import following
+from ..mesh.faces import Faces
+from ..mesh.geometry import turns
+from ..mesh.straightening import cross
+from .measures import PlaneMeasures
+from .prisms import simple_loops
+from .short_edges import STRAIGHT
+
+WORST = {"skewness": 3.5, "non_orthogonality": 60.0, "weight": 0.07, "volume_ratio": 0.015, "determinant": 2e-3}
+"""What cells may have after a cut; limits of OpenFOAM are a little farther."""
+SMALLER = ("weight", "volume_ratio", "determinant")
+"""Measures of which small values are bad."""
+SHARES = (0.25, 0.5, 0.75)
+"""Where a cut may end on a side, besides in its ends."""
+BESIDE = 0.05
+"""How far a new point on a face is moved off its other cell, over the length of the face, so that this stays convex."""
+LEAST_SHARE = 0.15
+"""Least share of the area that a cut gives to each of both cells."""
+FLAT, MOST_FILLED = 1e-3, (0.1, 1.0)
+"""Turn, in radians, of a wall within two cells up to which it is made straight, and the area that they may gain by it
+at each point, over their own: the second one where the first does not help."""
+SHARPEST = 0.1
+"""Least sine of the angles between a cut and the sides on which it ends."""
+TRIED = 24
+"""Cuts of one polygon whose measures are computed: those with the roundest halves."""
+RINGS = 2
+"""Rings of cells around two that are divided whose faces are computed; the outermost is not judged."""
+FAR = 10
+"""How many of the nearest cells a cell may share that has no faces, or only with cells that are no better."""
+ROUNDS = 4
+
+Side = tuple[int, int, int]
+"""First and last point of a side with the cell on the left, and the cell beyond it; -1 - wall on a wall."""
+Loops = dict[int, list[Side]]
+"""The sides of cells."""
+
+
+def redivide(mesh: Faces, parts: np.ndarray, rejected: np.ndarray) -> Faces:
+    """Return `mesh` with the cells `rejected` (n,) bool, and those of a small determinant, divided anew where it helps.
+
+    Parameters
+    ----------
+    mesh : Faces
+        A mesh for solvers in 2D.
+    parts : (k,) int
+        Index of the named part of the boundary for each wall.
+    """
+    for _ in range(ROUNDS):
+        rejected = rejected | (PlaneMeasures(mesh).determinant < WORST["determinant"])
+        if not rejected.any() or mesh.n_cells < 3:
+            return mesh
+        edit = _Edit(mesh, parts)
+        for cell in np.flatnonzero(rejected).tolist():
+            if cell not in edit.changed:
+                edit.change(cell)
+        if not edit.changed:
+            return mesh
+        mesh = edit.mesh()
+        rejected = badness(mesh) > 1
+    return mesh
+
+
+def badness(mesh: Faces) -> np.ndarray:
+    """Return the worst measure of each cell and its faces over that of `WORST`, (n,); inf if it is not convex."""
+    m, worst = PlaneMeasures(mesh), np.zeros(mesh.n_cells)
+    for name, limit in WORST.items():
+        values = getattr(m, name)
+        values = limit / np.maximum(values, 1e-12) if name in SMALLER else values / limit
+        if name == "determinant":
+            np.maximum(worst, values, out=worst)
+            continue
+        np.maximum.at(worst, mesh.owner, values)
+        np.maximum.at(worst, mesh.neighbor[: mesh.n_inner], values[: mesh.n_inner])
+    starts, loop, broken = simple_loops(mesh)
+    turn, cell = turns(mesh.points[loop], following(starts)), np.repeat(np.arange(mesh.n_cells), np.diff(starts))
+    worst[cell[turn < STRAIGHT / 2]] = worst[broken] = np.inf
+    worst[(m.areas <= 0) | (np.bincount(cell, turn, mesh.n_cells) > 3 * np.pi)] = np.inf
+    return worst
+
+
+class _Cut(NamedTuple):
+    """A cut of a polygon: the sides of both halves without the cut, its ends, and its new points by negative numbers.
+
+    The first half reaches from the first end along the outline to the second end.
+    """
+
+    first: list[Side]
+    second: list[Side]
+    ends: tuple[int, int]
+    points: dict[int, np.ndarray]
+
+
+class _Change(NamedTuple):
+    """The sides of cells after a change, and its new points by negative numbers."""
+
+    loops: Loops
+    points: dict[int, np.ndarray]
+
+
+class _Edit:
+    """Changes of single cells of a mesh, one after the other.
+
+    Attributes
+    ----------
+    points : list of (2,) float64
+        Those of the mesh, and new ones.
+    changed : Loops
+        The sides that cells have now.
+    """
+
+    def __init__(self, mesh: Faces, parts: np.ndarray) -> None:
+        self.old, self.parts = mesh, parts
+        self.points = list(mesh.points)
+        face = mesh.sides()[1]
+        begin, end = mesh.side_ends()
+        other = np.where(np.arange(len(face)) < len(mesh), mesh.neighbor[face], mesh.owner[face])
+        self.sides = np.column_stack([begin, end, other])
+        self.starts, self.rows = mesh.cell_faces()
+        self.changed: Loops = {}
+
+    def sides_of(self, cell: int) -> list[Side]:
+        """Return the sides of `cell`, one after the other if they are one loop."""
+        if cell in self.changed:
+            return self.changed[cell]
+        sides = [tuple(s) for s in self.sides[self.rows[self.starts[cell] : self.starts[cell + 1]]].tolist()]
+        after = {side[0]: side for side in sides}
+        found = [sides[0]]
+        while len(found) < len(sides) and found[-1][1] in after:
+            found.append(after[found[-1][1]])
+        return found if found[-1][1] == found[0][0] and len({s[0] for s in found}) == len(sides) else sides
+
+    def change(self, cell: int) -> None:
+        """Divide `cell` and another cell anew, by the cut that leaves the fewest bad cells and the best of them."""
+        near = sorted({side[2] for side in self.sides_of(cell) if side[2] >= 0} - {cell})
+        for most in MOST_FILLED:
+            if self._try(cell, near, True, most) or self._try(cell, near, False, most):
+                return
+        order = np.argsort(((self.old.generators - self.old.generators[cell]) ** 2).sum(axis=1), kind="stable")
+        self._try(cell, [c for c in order[1:FAR].tolist() if c not in near], False, MOST_FILLED[-1])
+
+    def _try(self, cell: int, others: list[int], union: bool, most: float) -> bool:
+        """Divide the `union` of a cell and one of `others`, or that one alone; return whether fewer cells are bad.
+
+        Of all cuts the one is taken that leaves the fewest bad cells, and of these the best.
+        """
+        best: tuple[tuple[int, float], _Change] | None = None
+        for other in others:
+            local, judged = self._around(cell, other)
+            outline, walled = (self._union(cell, other), {}) if union else self._without(cell, other, local)
+            cuts = self._cuts(self._straightened(outline, most)) if len(outline) > 2 else []
+            made = [_Change(local, {}), *(self._changed(cell, other, cut, {**local, **walled}) for cut in cuts)]
+            (count, _), *scores = self._scores(made, judged)
+            for (left, worst), change in zip(scores, made[1:], strict=True):
+                if left < count and (best is None or (left - count, worst) < best[0]):
+                    best = (left - count, worst), change
+        if best is None:
+            return False
+        change = best[1]
+        place = {name: len(self.points) + k for k, name in enumerate(change.points)}
+        self.points += change.points.values()
+        for c, loop in change.loops.items():
+            if loop != self.sides_of(c):
+                self.changed[c] = [(place.get(a, a), place.get(b, b), other) for a, b, other in loop]
+        return True
+
+    def _around(self, *cells: int) -> tuple[Loops, list[int]]:
+        """Return the sides of the cells around `cells`, and those of which all neighbors are there."""
+        around, known = [list(cells)], set(cells)
+        for _ in range(RINGS):
+            near = sorted({side[2] for c in around[-1] for side in self.sides_of(c) if side[2] >= 0} - known)
+            around.append(near)
+            known.update(near)
+        return {c: self.sides_of(c) for c in sorted(known)}, [c for ring in around[:-1] for c in ring]
+
+    def _union(self, cell: int, other: int) -> list[Side]:
+        """Return the sides of the union of two cells; empty if it is no simple polygon."""
+        found = []
+        for a, b in ((cell, other), (other, cell)):
+            loop = self.sides_of(a)
+            inner = [side[2] == b for side in loop]
+            first = [k for k in range(len(loop)) if inner[k - 1] and not inner[k]]
+            if len(first) != 1:
+                return []
+            loop = loop[first[0] :] + loop[: first[0]]
+            found += [side for side in loop if side[2] != b]
+        closed = all(found[k - 1][1] == found[k][0] for k in range(len(found)))
+        return found if closed and len({side[0] for side in found}) == len(found) else []
+
+    def _without(self, cell: int, other: int, local: Loops) -> tuple[list[Side], Loops]:
+        """Return the sides of `other`, and those of the neighbors of `cell`, with walls in place of `cell`."""
+        loops: Loops = {}
+        for near in {side[2] for side in local[cell] if side[2] >= 0}:
+            loop = []
+            for a, b, beyond in local[near]:
+                if beyond == cell:
+                    middle = (self.points[a] + self.points[b]) / 2
+                    beyond = -1 - int(self.old.domain.closest_walls(middle[None])[0])
+                loop.append((a, b, beyond))
+            loops[near] = loop
+        return loops.get(other, local[other]), loops
+
+    def _changed(self, cell: int, other: int, cut: _Cut, loops: Loops) -> _Change:
+        """Return what cells are after a cut: `cell` and `other` have a half each, the one nearer to its generator."""
+        halves, (p, q) = (cut.first, cut.second), cut.ends
+        middles = np.array([np.mean([cut.points.get(s[0], self._at(s[0])) for s in half], axis=0) for half in halves])
+        x = self.old.generators[[cell, other]]
+        if np.hypot(*(x - middles).T).sum() > np.hypot(*(x - middles[::-1]).T).sum():
+            halves, (p, q) = halves[::-1], (q, p)
+        made = {**loops, cell: [*halves[0], (q, p, other)], other: [*halves[1], (p, q, cell)]}
+        # Cells beyond see other cells, and new points on their sides.
+        beyond = [(b, a, name, near) for half, name in zip(halves, (cell, other), strict=True) for a, b, near in half]
+        for near in {side[3] for side in beyond if side[3] >= 0}:
+            ahead = {a: (a, b, name) for a, b, name, owner in beyond if owner == near}
+            made[near] = []
+            for a, b, behind in loops[near]:
+                if behind not in (cell, other):
+                    made[near].append((a, b, behind))
+                    continue
+                while a != b and a in ahead:
+                    made[near].append(ahead[a])
+                    a = ahead[a][1]
+        return _Change(made, cut.points)
+
+    def _at(self, point: int) -> np.ndarray:
+        """Return the place of a point; that of any for a new one."""
+        return self.points[max(point, 0)]
+
+    def _straightened(self, outline: list[Side], most: float) -> list[Side]:
+        """Return a polygon without the points of walls where it is not convex and does not grow by more than `most`.
+
+        Points stay where the named part changes.
+        """
+        found, k = list(outline), 0
+        x = np.array([self.points[side[0]] for side in outline])
+        most *= np.abs(cross(x - x[0], np.roll(x, -1, axis=0) - x[0]).sum())
+        while k < len(found) and len(found) > 3:
+            (a, b, wall), (_, d, after) = found[k - 1], found[k]
+            u, v = self.points[b] - self.points[a], self.points[d] - self.points[b]
+            turn = u[0] * v[1] - u[1] * v[0]
+            same = wall < 0 and after < 0 and self.parts[-1 - wall] == self.parts[-1 - after]
+            if same and -most < turn < FLAT * np.hypot(*u) * np.hypot(*v):
+                found[k - 1] = (a, d, wall)
+                del found[k]
+                k = max(k - 1, 0)
+            else:
+                k += 1
+        return found
+
+    def _cuts(self, outline: list[Side]) -> list[_Cut]:
+        """Return cuts of a polygon in two convex ones, those with the roundest halves first.
+
+        Cuts end in corners, or in new points on sides.
+        """
+        count, step = len(outline), len(SHARES) + 1
+        corner = np.array([self.points[side[0]] for side in outline])
+        way = np.roll(corner, -1, axis=0) - corner
+        inner = np.array([side[2] >= 0 for side in outline])
+        x = corner[:, None] + np.array([0, *SHARES])[:, None] * way[:, None]
+        x[:, 1:] += (BESIDE * inner[:, None] * np.column_stack([-way[:, 1], way[:, 0]]))[:, None]
+        x = x.reshape(-1, 2)
+        ahead = np.repeat(way / np.maximum(np.hypot(*way.T), 1e-300)[:, None], step, axis=0)
+        back = ahead.copy()
+        back[::step] = np.roll(ahead[::step], 1, axis=0)
+        bent = np.cumsum(cross(back, ahead) < np.where(np.arange(len(x)) % step == 0, STRAIGHT, -1.0))
+        i, j = np.triu_indices(len(x), 1)
+        sides = (j - 1) // step - i // step  # 0 if both ends are on one side
+        apart = (sides > 0) & ~((i == 0) & (j // step == count - 1))
+        i, j = i[apart], j[apart]
+        cut = x[j] - x[i]
+        length = np.maximum(np.hypot(*cut.T), 1e-300)
+        cut /= length[:, None]
+        sines = [cross(-cut, ahead[i]), cross(back[j], -cut), cross(cut, ahead[j]), cross(back[i], cut)]
+        good = np.min(sines, axis=0) > SHARPEST
+        good &= (bent[j - 1] == bent[i]) & (bent[-1] - bent[j] + np.where(i > 0, bent[i - 1], 0) == 0)
+        along = np.roll(x, -1, axis=0) - x
+        swept = np.append(0, np.cumsum(cross(x - x[0], x + along - x[0])))
+        walked = np.append(0, np.cumsum(np.hypot(*along.T)))
+        area = (swept[j] - swept[i] + cross(x[j] - x[0], x[i] - x[0])) / 2
+        other = swept[-1] / 2 - area
+        around = walked[j] - walked[i]
+        round_ = np.minimum(area / (around + length) ** 2, other / (walked[-1] - around + length) ** 2)
+        good &= np.minimum(area, other) >= LEAST_SHARE * (area + other)
+        chosen = np.flatnonzero(good)
+        found = []
+        for k in chosen[np.argsort(-round_[chosen], kind="stable")][:TRIED].tolist():
+            (first, f), (last, g) = divmod(int(i[k]), step), divmod(int(j[k]), step)
+            a, b, beyond = outline[first]
+            c, d, far = outline[last]
+            p, q = -2 if f else a, -3 if g else c
+            one = [(p, b, beyond), *outline[first + 1 : last], *([(c, q, far)] if g else [])]
+            two = [(q, d, far), *outline[last + 1 :], *outline[:first], *([(a, p, beyond)] if f else [])]
+            new = {name: place for name, place in ((p, x[i[k]]), (q, x[j[k]])) if name < 0}
+            found.append(_Cut(one, two, (p, q), new))
+        return found
+
+    def _scores(self, meshes: list[_Change], judged: list[int]) -> list[tuple[int, float]]:
+        """Return the number of bad cells among those `judged`, and the badness of the worst, of each of `meshes`."""
+        names = sorted(meshes[0].loops)
+        place = {c: k for k, c in enumerate(names)}
+        x: list[np.ndarray] = []
+        ends, owner, neighbor = [], [], []
+        for number, (loops, new) in enumerate(meshes):
+            base, known = number * len(names), {}
+            for c, loop in loops.items():
+                for a, b, other in loop:
+                    if other > c or other not in place:
+                        for p in (a, b):
+                            if p not in known:
+                                known[p] = len(x)
+                                x.append(new[p] if p < 0 else self.points[p])
+                        ends.append((known[a], known[b]))
+                        owner.append(base + place[c])
+                        neighbor.append(base + place[other] if other in place else -1)
+        nowhere = np.zeros((len(meshes) * len(names), 2))
+        made = _faces(self.old, nowhere, np.array(x), np.array(ends), np.array(owner), np.array(neighbor))
+        worst = badness(made).reshape(len(meshes), len(names))[:, [place[c] for c in judged]]
+        return [(int((row > 1).sum()), float(row.max())) for row in worst]
+
+    def mesh(self) -> Faces:
+        """Return the changed mesh."""
+        cell = np.repeat(np.arange(self.old.n_cells), np.diff(self.starts))
+        kept = ~np.isin(cell, list(self.changed))
+        sides = [np.column_stack([cell, self.sides[self.rows]])[kept]]
+        sides += [np.array([(c, *side) for side in loop]) for c, loop in self.changed.items()]
+        owner, begin, end, other = np.concatenate(sides).T
+        once = (other < 0) | (owner < other)
+        ends = np.column_stack([begin, end])[once]
+        generators = self.old.generators.copy()
+        for c, loop in self.changed.items():
+            x = np.array([self.points[side[0]] for side in loop])
+            if (cross(np.roll(x, -1, axis=0) - x, generators[c] - x) < 0).any():
+                generators[c] = x.mean(axis=0)
+        points = np.array(self.points)
+        return _faces(self.old, generators, points, ends, owner[once], other[once]).compact()
+
+
+def _faces(
+    old: Faces, generators: np.ndarray, points: np.ndarray, ends: np.ndarray, owner: np.ndarray, neighbor: np.ndarray
+) -> Faces:
+    """Return a mesh from the ends (f, 2) and cells of its faces, which come in the order of meshes."""
+    inner = neighbor >= 0
+    order = np.lexsort((np.where(inner, neighbor, owner), np.where(inner, owner, -1 - neighbor), ~inner))
+    return replace(
+        old,
+        generators=generators,
+        points=points,
+        corners=ends[order].ravel(),
+        starts=2 * np.arange(len(order) + 1),
+        owner=owner[order].astype(np.int32),
+        neighbor=neighbor[order].astype(np.int32),
+        twin=np.full(len(order), -1),
+        shift=np.zeros((len(order), 2), np.int8),
+        half_face=np.full(len(order), -1),
+    )
