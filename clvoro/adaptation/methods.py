@@ -145,62 +145,47 @@ class WeightedMethod(Method):
 
 @dataclass
 class ProjectedMethod(Method):
-    """Lloyd or quality descent with momentum, projected so that every cell keeps or gets its volume.
-
-    Attributes
-    ----------
-    descent : "lloyd", "quality", "edges" or "surface"
-        Displacement to the weighted centroid, with which lattice defects glide and annihilate; in 2D descent of the
-        cell quality, which improves cells and pins defects, and of an energy against short edges; or descent of this
-        energy alone; in 3D "surface", descent of the cell quality.
-    relaxation : float
-        Factor on the descent.
-    calm_relaxation : float
-        Largest factor at thin walls.
-    momentum : float
-        Share of the last displacement that is added.
-    penalty : float
-        Penalty eps of the projection: the smaller, the more accurate the sizes.
-    quality_scale, log_ratio_scale, power : float, float, int
-        Scales and power of the penalty; see `Penalty`.
-    iterations, tolerance : int, float
-        Limits of each projection. Each one starts from the last solution, and leaves a residual to the next step.
-    k : float
-        Largest displacement over h.
-    bad_cell_weight, rate : float
-        Weight of bad cells in the quality descent, and its step length; see `QualityDescent` and `SurfaceDescent`.
-    error_target : float
-        Mean |log(L / h)| to which the penalty is controlled after three steps; 0 keeps the penalty.
-    careful : bool
-        Keep the penalty above `EXACT_PENALTY_PER_ERROR` times what the mean |log(L / h)| is beyond `MET_ERROR`.
-    correct_mean : bool
-        Also correct the mean log ratio by moving generators to where h is larger or smaller. For small means only: a
-        wrong number of generators is corrected by insertion and deletion.
-    gradient_from_field : bool
-        Take grad log h from the field, by differences over a fifth of a cell, not from h at the neighbors. At kinks of
-        h the fit to the neighbors can prevent the exact projection from converging.
-    steps : int
-        Steps done.
-    """
+    """Lloyd or quality descent with momentum, projected so that every cell keeps or gets its volume."""
 
     descent: Literal["lloyd", "quality", "edges", "surface"] = "lloyd"
+    """Displacement to the weighted centroid, with which lattice defects glide and annihilate; in 2D descent of the cell
+    quality, which improves cells and pins defects, and of an energy against short edges; or descent of this energy
+    alone; in 3D "surface", descent of the cell quality."""
     relaxation: float = 1.0
+    """Factor on the descent."""
     momentum: float = 0.7
+    """Share of the last displacement that is added."""
     penalty: float = 0.1
+    """Penalty eps of the projection: the smaller, the more accurate the sizes."""
     quality_scale: float = 0.0
     log_ratio_scale: float = 0.0
     power: int = 2
+    """`quality_scale`, `log_ratio_scale`, `power`: float, float, int. Scales and power of the penalty; see
+    `Penalty`."""
     iterations: int = 30
     tolerance: float = 1e-2
+    """`iterations`, `tolerance`: int, float. Limits of each projection. Each one starts from the last solution, and
+    leaves a residual to the next step."""
     k: float = 0.4
+    """Largest displacement over h."""
     bad_cell_weight: float = 20.0
     rate: float = 0.1
+    """`bad_cell_weight`, `rate`: weight of bad cells in the quality descent, and its step length; see `QualityDescent`
+    and `SurfaceDescent`."""
     error_target: float = 0.0
+    """Mean |log(L / h)| to which the penalty is controlled after three steps; 0 keeps the penalty."""
     gradient_from_field: bool = False
+    """Take grad log h from the field, by differences over a fifth of a cell, not from h at the neighbors. At kinks of h
+    the fit to the neighbors can prevent the exact projection from converging."""
     correct_mean: bool = False
+    """Also correct the mean log ratio by moving generators to where h is larger or smaller. For small means only: a
+    wrong number of generators is corrected by insertion and deletion."""
     calm_relaxation: float = 1.3
+    """Largest factor at thin walls."""
     careful: bool = False
+    """Keep the penalty above `EXACT_PENALTY_PER_ERROR` times what the mean |log(L / h)| is beyond `MET_ERROR`."""
     steps: int = 0
+    """Steps done."""
 
     def step(self, mesh: MeshState) -> Displacement:
         """Evaluate the descent, with momentum, and its projection."""

@@ -22,20 +22,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Moving:
-    """Generators that a stage moves.
-
-    Attributes
-    ----------
-    points, velocity : (n, d) real
-        Both change by the same displacement.
-    labels, fixed : (n,) int32, int
-        Generators with labels below `fixed` do not move.
-    """
+    """Generators that a stage moves."""
 
     points: cla.Array
     velocity: cla.Array
+    """`points`, `velocity`: (n, d) real. Both change by the same displacement."""
     labels: cla.Array
     fixed: int
+    """`labels`, `fixed`: (n,) int32, int. Generators with labels below `fixed` do not move."""
 
 
 @dataclass(frozen=True)
@@ -82,22 +76,15 @@ class Method(ABC):
 
 @dataclass(frozen=True)
 class Balls:
-    """Balls around fixed generators, in the device's coordinates, that other generators do not enter.
-
-    Attributes
-    ----------
-    first, count : int
-        Labels of these generators: `first`, `first` + 1, ...
-    starts : (count + 1,) int32
-        Balls of each of them.
-    spheres : (k, d + 1) real
-        Centers and radii.
-    """
+    """Balls around fixed generators, in the device's coordinates, that other generators do not enter."""
 
     first: int
     count: int
+    """`first`, `count`: labels of these generators: `first`, `first` + 1, ..."""
     starts: cla.Array
+    """(count + 1,) int32. Balls of each of them."""
     spheres: cla.Array
+    """(k, d + 1) real. Centers and radii."""
 
 
 class Motion:

@@ -28,30 +28,21 @@ from .trisk import find_weights
 
 @dataclass(frozen=True)
 class Shape:
-    """Places and measures of cells and edges, as the file has them.
-
-    Attributes
-    ----------
-    edges : (e, d) float
-        Places of the edges.
-    kites : (h,) float
-        Signed area of the kite of generator, edge, begin of the half-edge, and previous edge.
-    areas : (n,) float
-        Areas of cells as sums of their kites, so that both add up to the same total.
-    lengths, distances, angles : (e,) float
-        Length of each edge, distance of its generators, and angle of its normal from the x axis, on a sphere from the
-        direction to the east.
-    reach : (d,) float
-        Largest distance of a corner or of a neighbor from the generator of a cell, along each axis.
-    """
+    """Places and measures of cells and edges, as the file has them."""
 
     edges: np.ndarray
+    """(e, d) float. Places of the edges."""
     kites: np.ndarray
+    """(h,) float. Signed area of the kite of generator, edge, begin of the half-edge, and previous edge."""
     areas: np.ndarray
+    """(n,) float. Areas of cells as sums of their kites, so that both add up to the same total."""
     lengths: np.ndarray
     distances: np.ndarray
     angles: np.ndarray
+    """`lengths`, `distances`, `angles`: (e,) float. Length of each edge, distance of its generators, and angle of its
+    normal from the x axis, on a sphere from the direction to the east."""
     reach: np.ndarray
+    """(d,) float. Largest distance of a corner or of a neighbor from the generator of a cell, along each axis."""
 
 
 def measure(diagram: Diagram, halves: HalfEdges) -> Shape:

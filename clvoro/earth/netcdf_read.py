@@ -30,30 +30,21 @@ from their cells."""
 
 @dataclass
 class MeshInFile:
-    """The cells of a mesh on a sphere, as a file has them.
-
-    Attributes
-    ----------
-    radius : float
-    points, vertices : (n, 3), (v, 3) float64
-        Generators and corners on the sphere.
-    counts : (n,) int
-        Numbers of corners of the cells.
-    corners : (m,) int
-        Corners of the cells, one cell after the other, counter-clockwise.
-    middles : (m, 3) float64, optional
-        For the face from each corner to the next the middle of the arc between its generators.
-    of_run : three (n,) float64, optional
-        Size, error and quality.
-    """
+    """The cells of a mesh on a sphere, as a file has them."""
 
     radius: float
     points: np.ndarray
     vertices: np.ndarray
+    """`points`, `vertices`: (n, 3), (v, 3) float64. Generators and corners on the sphere."""
     counts: np.ndarray
+    """(n,) int. Numbers of corners of the cells."""
     corners: np.ndarray
+    """(m,) int. Corners of the cells, one cell after the other, counter-clockwise."""
     middles: np.ndarray | None = None
+    """(m, 3) float64, optional. For the face from each corner to the next the middle of the arc between its
+    generators."""
     of_run: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
+    """three (n,) float64, optional. Size, error and quality."""
 
 
 def make_diagram(cells: MeshInFile) -> Diagram:

@@ -28,20 +28,15 @@ _LINES = "lines: an array (k, 2), a list of such arrays, shapely LineStrings or 
 
 @dataclass(frozen=True)
 class LonLatArea:
-    """Polygons on a sphere.
-
-    Attributes
-    ----------
-    outer, holes : (k,) arrays of shapely geometries
-        Rings as regions of the plane with continuous longitudes, in [-180, 180] and beyond.
-    piece_of_outer, piece_of_hole : (k,) int
-        Polygon that each of them belongs to.
-    """
+    """Polygons on a sphere."""
 
     outer: np.ndarray
     holes: np.ndarray
+    """`outer`, `holes`: (k,) arrays of shapely geometries. Rings as regions of the plane with continuous longitudes, in
+    [-180, 180] and beyond."""
     piece_of_outer: np.ndarray
     piece_of_hole: np.ndarray
+    """`piece_of_outer`, `piece_of_hole`: (k,) int. Polygon that each of them belongs to."""
 
     def contains(self, lonlat: np.ndarray) -> np.ndarray:
         """Return whether each position (n, 2), longitudes in [-180, 180], is in a polygon or on its edge; (n,) bool."""

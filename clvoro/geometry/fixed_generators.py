@@ -30,27 +30,21 @@ class FixedGenerators:
 
     Each place is the center of a ball; the generators that are to meet there are on its sphere or within. Others stay
     outside. So two neighboring places belong to the cells of the generators of both, with all that is between them.
-
-    Attributes
-    ----------
-    points : (n, d) float64
-    centers, radii : (b, d) and (b,) float64
-        Balls without other generators.
-    ball_starts, balls : (n + 1,) and (k,) int32
-        The balls of generator i are ``balls[ball_starts[i]:ball_starts[i + 1]]``.
-    left_out : (k, d) float64
-        Places on lines or creases without room for generators.
-    n_sized : int
-        How many of the last generators have cells that keep their size, as their target size.
     """
 
     points: np.ndarray
+    """(n, d) float64."""
     centers: np.ndarray
     radii: np.ndarray
+    """`centers`, `radii`: (b, d) and (b,) float64. Balls without other generators."""
     ball_starts: np.ndarray
     balls: np.ndarray
+    """`ball_starts`, `balls`: (n + 1,) and (k,) int32. The balls of generator i are
+    ``balls[ball_starts[i]:ball_starts[i + 1]]``."""
     left_out: np.ndarray
+    """(k, d) float64. Places on lines or creases without room for generators."""
     n_sized: int = field(default=0, kw_only=True)
+    """How many of the last generators have cells that keep their size, as their target size."""
 
     least_cells = 0
     """Least number of cells of a mesh for each of them."""

@@ -24,55 +24,39 @@ ADDRESSING = ("cellProcAddressing", "faceProcAddressing", "pointProcAddressing",
 
 @dataclass(frozen=True)
 class FoamPatch:
-    """A part of the boundary.
-
-    Attributes
-    ----------
-    name, kind : str
-    size : int
-        Number of faces.
-    entries : tuple of str
-        Further entries of its dictionary.
-    """
+    """A part of the boundary."""
 
     name: str
     kind: str
     size: int
+    """Number of faces."""
     entries: tuple[str, ...] = ()
+    """Further entries of its dictionary."""
 
 
 @dataclass(frozen=True)
 class FoamPiece:
-    """The mesh of one processor, or the whole mesh.
-
-    Attributes
-    ----------
-    points : (v, 3) float
-    starts, corners : arrays
-        Loops of the faces; see `Faces`.
-    owner, neighbor : (f,), (i,) int
-        Cells of the faces, and of the first i of them the cells on the other side.
-    patches : list of FoamPatch
-        Of the other faces.
-    cells, faces, used : (n,), (f,), (v,) int
-        Numbers of cells, faces and points in the whole mesh.
-    turned : (f,) bool
-        Which faces have the opposite orientation in the whole mesh.
-    patch_numbers : list of int
-        Number of each patch in the whole mesh; -1 for patches between processors.
-    """
+    """The mesh of one processor, or the whole mesh."""
 
     points: np.ndarray
+    """(v, 3) float."""
     starts: np.ndarray
     corners: np.ndarray
+    """`starts`, `corners`: loops of the faces; see `Faces`."""
     owner: np.ndarray
     neighbor: np.ndarray
+    """`owner`, `neighbor`: (f,), (i,) int. Cells of the faces, and of the first i of them the cells on the other
+    side."""
     patches: list[FoamPatch]
+    """Of the other faces."""
     cells: np.ndarray
     faces: np.ndarray
     used: np.ndarray
+    """`cells`, `faces`, `used`: (n,), (f,), (v,) int. Numbers of cells, faces and points in the whole mesh."""
     turned: np.ndarray
+    """(f,) bool. Which faces have the opposite orientation in the whole mesh."""
     patch_numbers: list[int]
+    """list of int. Number of each patch in the whole mesh; -1 for patches between processors."""
 
     @classmethod
     def whole(cls, mesh: Faces, patches: list[FoamPatch]) -> FoamPiece:

@@ -246,27 +246,19 @@ def _count_faces(diagram: Diagram) -> np.ndarray:
 
 @dataclass(frozen=True)
 class CellKind:
-    """What a file has of cells of one dimension.
-
-    Attributes
-    ----------
-    number : int
-        VTK's number of the kind.
-    counts : str
-        Name of the cell data with the numbers of sides or faces.
-    stream : (str, str)
-        Names of the arrays with the ends of the cells' parts and their items.
-    topology, count, written : functions
-        Of a diagram: VTK's arrays (also of a mesh for solvers), numbers of sides or faces, and which half-faces are
-        written.
-    """
+    """What a file has of cells of one dimension."""
 
     number: int
+    """VTK's number of the kind."""
     counts: str
+    """Name of the cell data with the numbers of sides or faces."""
     stream: tuple[str, str]
+    """(str, str). Names of the arrays with the ends of the cells' parts and their items."""
     topology: Callable[[Diagram | Faces], dict[str, np.ndarray]]
     count: Callable[[Diagram], np.ndarray]
     written: Callable[[Diagram], np.ndarray]
+    """`topology`, `count`, `written`: of a diagram: VTK's arrays (also of a mesh for solvers), numbers of sides or
+    faces, and which half-faces are written."""
 
 
 KINDS = {

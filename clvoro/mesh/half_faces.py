@@ -189,36 +189,26 @@ class HalfEdges:
 
     A half-edge runs counter-clockwise around its cell, which lies on its left. An edge between two cells is a pair of
     half-edges in opposite directions; an edge on the boundary is a single one.
-
-    Attributes
-    ----------
-    rows : (h,) int
-        Place of each half-edge in the diagram's graph.
-    cell : (h,) int
-    starts : (n + 1,) int
-        Cell i has the half-edges `starts[i]` to `starts[i + 1]`.
-    begin, end : (h,) int
-        Vertices of the diagram.
-    next, previous : (h,) int
-        Next and previous half-edge in the loop.
-    twin : (h,) int
-        The opposite half-edge; -1 on the boundary.
-    edge : (h,) int
-        Number of the edge.
-    first : (e,) int
-        The lower-numbered half-edge of each edge, ascending: edges are sorted by their lower cell.
     """
 
     rows: np.ndarray
+    """(h,) int. Place of each half-edge in the diagram's graph."""
     cell: np.ndarray
+    """(h,) int."""
     starts: np.ndarray
+    """(n + 1,) int. Cell i has the half-edges `starts[i]` to `starts[i + 1]`."""
     begin: np.ndarray
     end: np.ndarray
+    """`begin`, `end`: (h,) int. Vertices of the diagram."""
     next: np.ndarray
     previous: np.ndarray
+    """`next`, `previous`: (h,) int. Next and previous half-edge in the loop."""
     twin: np.ndarray
+    """(h,) int. The opposite half-edge; -1 on the boundary."""
     edge: np.ndarray
+    """(h,) int. Number of the edge."""
     first: np.ndarray
+    """(e,) int. The lower-numbered half-edge of each edge, ascending: edges are sorted by their lower cell."""
 
     @property
     def counts(self) -> np.ndarray:

@@ -26,17 +26,13 @@ def count_sides(diagram: Diagram) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Straightened:
-    """The cells of a diagram in 2D as polygons with straight sides.
-
-    Attributes
-    ----------
-    sides : (n,) int
-    areas, perimeters : (n,) float
-    """
+    """The cells of a diagram in 2D as polygons with straight sides."""
 
     sides: np.ndarray
+    """(n,) int."""
     areas: np.ndarray
     perimeters: np.ndarray
+    """`areas`, `perimeters`: (n,) float."""
 
     def quality(self) -> np.ndarray:
         """Return the paper's (4.1), 4 A n tan(pi / n) / P^2, of each, (n,)."""
@@ -170,20 +166,14 @@ def choose_corners(chain: np.ndarray, chosen: np.ndarray, size: np.ndarray) -> N
 
 @dataclass(frozen=True)
 class _Sides:
-    """Straight sides along the boundary.
-
-    Attributes
-    ----------
-    cell, run : (s,) int
-        Cell, and number of its part of a ring.
-    begin, end : (s, 2) float64
-        Relative to the generator.
-    """
+    """Straight sides along the boundary."""
 
     cell: np.ndarray
     run: np.ndarray
+    """`cell`, `run`: (s,) int. Cell, and number of its part of a ring."""
     begin: np.ndarray
     end: np.ndarray
+    """`begin`, `end`: (s, 2) float64. Relative to the generator."""
 
 
 def _straight_sides(diagram: Diagram, domain: Polygon, owner: np.ndarray) -> _Sides:

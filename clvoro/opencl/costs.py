@@ -44,27 +44,20 @@ class Cost:
 
 @dataclass
 class TimeSpan:
-    """The time between two rows of a run's history.
-
-    Attributes
-    ----------
-    step, level, cells : int or None
-        Of the row at its end. Step 0 is the time before the first step. None: the time after the last row.
-    wall : float
-        Seconds by the clock.
-    stages : dict
-        Device time per stage.
-    read : int
-        Bytes that the host has read from the device.
-    """
+    """The time between two rows of a run's history."""
 
     began: float
     step: int | None = None
     level: int | None = None
     cells: int | None = None
+    """`step`, `level`, `cells`: int or None. Of the row at its end. Step 0 is the time before the first step. None: the
+    time after the last row."""
     wall: float = 0.0
+    """Seconds by the clock."""
     stages: dict[str, float] = field(default_factory=dict)
+    """Device time per stage."""
     read: int = 0
+    """Bytes that the host has read from the device."""
 
     @property
     def host(self) -> float:

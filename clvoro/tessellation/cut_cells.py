@@ -68,32 +68,23 @@ def clip_each(
 
 @dataclass(frozen=True)
 class CutCells:
-    """Cells clipped independently of each other, on the device; see `clip_polyhedra` in `polyhedra.cl`.
-
-    Attributes
-    ----------
-    places, counts : (n,) int32
-        First entry of each cell in the arrays of faces, and number of its faces.
-    labels, measures, centroids
-        Arrays of `m` half-faces.
-    cells : dict
-        Volumes, offsets and covariances.
-    corners, keys : arrays, optional
-        Triples of faces and keys; see `Tessellation.vertices`.
-    state : int
-        The state of triples that is written besides those of clear cells (tessellation/row_counts.h).
-    """
+    """Cells clipped independently of each other, on the device; see `clip_polyhedra` in `polyhedra.cl`."""
 
     places: cla.Array
     counts: cla.Array
+    """`places`, `counts`: (n,) int32. First entry of each cell in the arrays of faces, and number of its faces."""
     labels: cla.Array
     measures: cla.Array
     centroids: cla.Array
+    """`labels`, `measures`, `centroids`: arrays of `m` half-faces."""
     cells: dict[str, cla.Array]
+    """Volumes, offsets and covariances."""
     m: int
     corners: cla.Array | None = None
     keys: cla.Array | None = None
+    """`corners`, `keys`: triples of faces and keys; see `Tessellation.vertices`."""
     state: int = KNOWN_CORNERS
+    """The state of triples that is written besides those of clear cells (tessellation/row_counts.h)."""
 
     def output(self, report: cla.Array) -> tuple[object, ...]:
         """Return the CELL_OUTPUT_ARGS of kernels (tessellation/row_counts.h)."""

@@ -45,25 +45,17 @@ FLAT = 1e-3
 
 @dataclass(frozen=True)
 class Connections:
-    """The simplices around each generator of a lattice, on the device.
-
-    Attributes
-    ----------
-    starts : (n + 1,) int32
-        Row of each generator.
-    vertices : (m, d) int32
-        The other vertices of each of its simplices: generators, then images.
-    owners, codes : (g,) int32
-        Of the images; see `Mirrored`.
-    reference : (n, d) real
-        Positions in the lattice.
-    """
+    """The simplices around each generator of a lattice, on the device."""
 
     starts: cla.Array
+    """(n + 1,) int32. Row of each generator."""
     vertices: cla.Array
+    """(m, d) int32. The other vertices of each of its simplices: generators, then images."""
     owners: cla.Array
     codes: cla.Array
+    """`owners`, `codes`: (g,) int32. Of the images; see `Mirrored`."""
     reference: cla.Array
+    """(n, d) real. Positions in the lattice."""
 
 
 def connect(engine: Engine, domain: Domain, points: np.ndarray) -> Connections:

@@ -36,21 +36,14 @@ _ROUNDS = 50
 
 @dataclass(frozen=True)
 class Span:
-    """A smooth part of a curve, for parameters from `begin` to `end`.
-
-    Attributes
-    ----------
-    begin, end : float
-    at : callable
-        Takes parameters (n,) and returns points (n, 2) and derivatives (n, 2) by the parameter.
-    samples : int
-        Number of intervals that show the shape of the span.
-    """
+    """A smooth part of a curve, for parameters from `begin` to `end`."""
 
     begin: float
     end: float
     at: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
+    """Takes parameters (n,) and returns points (n, 2) and derivatives (n, 2) by the parameter."""
     samples: int = SAMPLES
+    """Number of intervals that show the shape of the span."""
 
     def nearest(self, points: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
         """Return the parameters (n,) from `lower` to `upper`, (n,) each, of the nearest points to `points` (n, 2).

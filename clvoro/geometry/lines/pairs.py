@@ -47,16 +47,11 @@ _CLEAR = 1.06  # radius in which no other generators are, over that of the circl
 
 @dataclass(frozen=True)
 class LinePairs(FixedGenerators):
-    """The generators beside lines. Balls are around the stations.
-
-    Attributes
-    ----------
-    chords, sizes : (c, 2, 2) and (c,) float64
-        Where faces are to lie, and sizes of the cells beside them.
-    """
+    """The generators beside lines. Balls are around the stations."""
 
     chords: np.ndarray
     sizes: np.ndarray
+    """`chords`, `sizes`: (c, 2, 2) and (c,) float64. Where faces are to lie, and sizes of the cells beside them."""
 
 
 class _Piece(NamedTuple):
@@ -88,29 +83,21 @@ class _Corner(NamedTuple):
 
 @dataclass
 class _Layout:
-    """Balls and generators of one attempt.
-
-    Attributes
-    ----------
-    points, heights, pieces : lists
-        Of each generator: place, least distance from its lines, and piece.
-    centers, radii, members : lists
-        Of each ball: center, radius, and its generators.
-    chords, sizes : lists
-        Of each chord: ends (2, 2), and size of the cells beside it.
-    tight : list of (x, y, length)
-        Chords that have to be shorter.
-    """
+    """Balls and generators of one attempt."""
 
     points: list[np.ndarray] = field(default_factory=list)
     heights: list[float] = field(default_factory=list)
     pieces: list[int] = field(default_factory=list)
+    """`points`, `heights`, `pieces`: of each generator: place, least distance from its lines, and piece."""
     centers: list[np.ndarray] = field(default_factory=list)
     radii: list[float] = field(default_factory=list)
     members: list[list[int]] = field(default_factory=list)
+    """`centers`, `radii`, `members`: of each ball: center, radius, and its generators."""
     chords: list[np.ndarray] = field(default_factory=list)
     sizes: list[float] = field(default_factory=list)
+    """`chords`, `sizes`: of each chord: ends (2, 2), and size of the cells beside it."""
     tight: list[tuple[float, float, float]] = field(default_factory=list)
+    """list of (x, y, length). Chords that have to be shorter."""
     blamed: set[int] = field(default_factory=set)
     at_nodes: dict[tuple[int, float, float], int] = field(default_factory=dict)
 

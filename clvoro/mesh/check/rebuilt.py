@@ -84,18 +84,13 @@ ADOPTED = 1024
 
 @dataclass(frozen=True)
 class Doubts:
-    """Bounds of the round-off in the numbers of a diagram.
-
-    Attributes
-    ----------
-    measures, middles : (m,) float
-        Bounds for the measures and the centroids of faces.
-    volumes : (n,) float
-    """
+    """Bounds of the round-off in the numbers of a diagram."""
 
     measures: np.ndarray
     middles: np.ndarray
+    """`measures`, `middles`: (m,) float. Bounds for the measures and the centroids of faces."""
     volumes: np.ndarray
+    """(n,) float."""
 
 
 class Rebuilt:

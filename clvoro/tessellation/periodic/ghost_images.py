@@ -30,15 +30,11 @@ OTHER_CELLS = 0.1
 
 @dataclass(frozen=True)
 class ExtendedBox(ClipBox):
-    """A periodic box with its halo, in the device's coordinates.
-
-    Attributes
-    ----------
-    lower, upper : (d,) float
-    """
+    """A periodic box with its halo, in the device's coordinates."""
 
     lower: np.ndarray
     upper: np.ndarray
+    """`lower`, `upper`: (d,) float."""
 
     def device_corners(self, real: np.dtype) -> tuple[np.ndarray, np.ndarray]:
         """Return the corners, padded to four numbers."""

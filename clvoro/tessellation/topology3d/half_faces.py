@@ -20,37 +20,26 @@ MOST_LOOP_ENTRIES = 2**31 - 1
 
 @dataclass(frozen=True)
 class HalfFaces:
-    """Corners of all cells, and loops of corners around their faces, on the device.
-
-    Attributes
-    ----------
-    corners : (c, 3) real
-        Relative to the generator `owners` (c,) int32.
-    sharpness : (c,) float32
-        How well its faces determine a corner.
-    corner_faces : (c, 3) int32
-        Labels of the faces that meet there: a generator, or ``-1 - wall``.
-    same, twin_corners : (c,) int32
-        A corner of the same cell, and one of another cell, at the same vertex.
-    starts : (n + 1,) int32
-        Rows of half-faces: those of the graph in its order, then walls that the graph leaves out.
-    labels : (h,) int32
-        Of half-faces.
-    loop_starts : (h + 1,) int32
-    loops : (3 c,) int32
-        Corners, counter-clockwise from outside.
-    """
+    """Corners of all cells, and loops of corners around their faces, on the device."""
 
     corners: cla.Array
+    """(c, 3) real. Relative to the generator `owners` (c,) int32."""
     owners: cla.Array
     sharpness: cla.Array
+    """(c,) float32. How well its faces determine a corner."""
     corner_faces: cla.Array
+    """(c, 3) int32. Labels of the faces that meet there: a generator, or ``-1 - wall``."""
     same: cla.Array
     twin_corners: cla.Array
+    """`same`, `twin_corners`: (c,) int32. A corner of the same cell, and one of another cell, at the same vertex."""
     starts: cla.Array
+    """(n + 1,) int32. Rows of half-faces: those of the graph in its order, then walls that the graph leaves out."""
     labels: cla.Array
+    """(h,) int32. Of half-faces."""
     loop_starts: cla.Array
+    """(h + 1,) int32."""
     loops: cla.Array
+    """(3 c,) int32. Corners, counter-clockwise from outside."""
 
 
 def _kernels(engine: Engine, capacity: int) -> Kernels:
