@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -35,22 +35,12 @@ from .moving.lattice import lattice_points
 from .options import Options
 from .plan.actions import Action, Prescribe
 from .plan.efforts import NEAR_COUNT, NEAR_ERROR, choose_error_target, is_near, steep_share
-from .plan.schedule import adaptive_schedule, auto_levels, repeated_schedule
+from .plan.schedule import Begins, adaptive_schedule, auto_levels, repeated_schedule
 from .sampling.quadrature import DensityTree
-from .sampling.start import charted, density_tree, sample_density, sample_uniform
+from .sampling.start import charted, density_tree, replace_far, sample_density, sample_uniform
 from .stages import Stages
 from .state import MeshState, Setup
-from .tuning import (
-    CELLS_ACROSS,
-    GRADIENT_STEP,
-    LEAST_STEEP,
-    MOVES,
-    NEAR_SIZE,
-    OPENINGS,
-    SAMPLED_SIZES,
-    STEPS,
-    USELESS_ERROR,
-)
+from .tuning import CELLS_ACROSS, GRADIENT_STEP, LEAST_STEEP, MOVES, NEAR_SIZE, OPENINGS, SAMPLED_SIZES, STEPS
 
 _APART = 0.7
 """Least distance of generators around concave creases from those beside surfaces inside, over h."""
@@ -63,7 +53,7 @@ class Prepared:
     options: Options
     setup: Setup
     points: np.ndarray | None
-    """(n, d) ndarray or None. Generators of the caller."""
+    """(n, d) ndarray or None. Generators of the caller, or some of them and new ones (`without_far`)."""
     rows: np.ndarray
     """(m, d) ndarray. Generators of layers, which do not move."""
     tree: DensityTree | None
@@ -77,10 +67,18 @@ class Prepared:
     levels: int
     """Number of coarser levels."""
     kept_rows: np.ndarray | None
-    """(n,) int or None. Indices of `points` among those that the caller has given, if points in layers of a solid are
-    left out."""
+    """(n,) int or None. Indices of `points` among those that the caller has given, if not all are kept; -1 for new
+    ones."""
     memory: float
     """Estimated device memory of the run, or of reading its diagram, in bytes."""
+
+    @property
+    def origins(self) -> np.ndarray | None:
+        """For each generator at the start its index in the points of the caller, or -1; None if there are none."""
+        if self.points is None:
+            return None
+        own = np.arange(len(self.points)) if self.kept_rows is None else self.kept_rows
+        return np.concatenate([np.full(len(self.rows), -1), own]).astype(np.int32)
 
 
 class GivenPoints(NamedTuple):
@@ -89,7 +87,7 @@ class GivenPoints(NamedTuple):
     near: bool = False
     """Their mesh nearly has the sizes: it is only corrected."""
     replaced: bool = False
-    """Their mesh is far from the sizes: the run begins with random points."""
+    """Random points replace those that are far from the sizes."""
     why: str = ""
     """The reason, for the settings of the result; empty if there are no points, or the method keeps their number."""
 
@@ -137,8 +135,11 @@ def prepare(
     if domain.borders is not None:
         field = limit_beside_borders(field, *domain.borders.narrow_places(free, field))
     kept_rows = None
-    if points is not None and domain.extrudes_layers and options.layers:
-        kept_rows = np.flatnonzero(beyond_layers(domain, options.layers, points))
+    if points is not None and options.layers:
+        beyond = (
+            beyond_layers(domain, options.layers, points) if domain.extrudes_layers else apart_from(points, rows, free)
+        )
+        kept_rows = np.flatnonzero(beyond)
         if not kept_rows.size:
             raise InputError(
                 f"points has {len(points)} points in the layers, expected some beyond them; give others, or leave "
@@ -391,7 +392,7 @@ def start(prepared: Prepared) -> MeshState:
         host = _sample(prepared)
     check_precision(setup.sizing, domain, host, setup.factor)
     if len(rows):
-        host = np.concatenate([rows, apart_from(host, rows, setup.free)])
+        host = np.concatenate([rows, host[apart_from(host, rows, setup.free)]])
     placed = domain.place(host, engine.real)
     labels = np.arange(setup.first_row, setup.first_row + len(host), dtype=np.int32)
     taken = np.full(len(fixed), -1, np.int32)
@@ -407,15 +408,42 @@ def start(prepared: Prepared) -> MeshState:
 
 def _sample(prepared: Prepared) -> np.ndarray:
     """Return random generators of the coarsest level."""
-    setup, options, levels = prepared.setup, prepared.options, prepared.levels
+    setup, options = prepared.setup, prepared.options
     domain, real = setup.domain, setup.stages.engine.real
-    cells = (prepared.target - len(prepared.rows)) / 2 ** (domain.cell_dim * levels)
-    n = max(setup.free.least_cells(levels > 0), round(cells))
+    n = _cells_at_start(prepared)
     if n < domain.evenly_below:
         return domain.even_points(n)
     if options.start == "uniform":
         return sample_uniform(setup.free, n, options.seed, real)
     return sample_density(setup.sizing, setup.free, n, options.seed, real, prepared.tree)
+
+
+def _cells_at_start(prepared: Prepared) -> int:
+    """Return the number of cells of the coarsest level, without those of layers."""
+    cells = (prepared.target - len(prepared.rows)) / 2 ** (prepared.setup.domain.cell_dim * prepared.levels)
+    return max(prepared.setup.free.least_cells(prepared.levels > 0), round(cells))
+
+
+def without_far(prepared: Prepared, max_levels: int | None = None) -> Prepared:
+    """Return the same run with new points in place of those of the caller that are far from the sizes.
+
+    If all are, the run begins as if there were none.
+    """
+    given, setup, options = prepared.points, prepared.setup, prepared.options
+    assert given is not None
+    n, real = _cells_at_start(prepared), setup.stages.engine.real
+    points, rows = replace_far(given, setup.sizing, setup.free, n, options.seed, real, prepared.tree)
+    if len(rows) == len(given):
+        return prepared
+    before = np.arange(len(given)) if prepared.kept_rows is None else prepared.kept_rows
+    if len(rows):
+        new = np.full(len(points) - len(rows), -1)
+        return replace(prepared, points=points, kept_rows=np.concatenate([before[rows], new]))
+    levels = _count_levels(setup, None, prepared.target, len(prepared.rows), options)
+    levels = levels if max_levels is None else min(levels, max_levels)
+    # Points are drawn for the coarsest level from the tree as it was.
+    tree = density_tree(setup.sizing, setup.free)
+    return replace(prepared, points=None, kept_rows=None, levels=levels, tree=tree)
 
 
 def judge_points(prepared: Prepared, mesh: MeshState) -> GivenPoints:
@@ -425,36 +453,35 @@ def judge_points(prepared: Prepared, mesh: MeshState) -> GivenPoints:
         return GivenPoints()
     s = mesh.summaries.read()
     mean, quality = s["error"].magnitude / n, s["quality"].sum / n
-    if mean > USELESS_ERROR and options.levels == "auto":
-        return GivenPoints(
-            replaced=True,
-            why=f"the given mesh is far from the sizes, and a new one was made (mean |e| {mean:.2g}; far means above "
-            f"{USELESS_ERROR:g})",
-        )
-    if prepared.levels:
-        return GivenPoints(
-            why=f"the given points are too few to be corrected: {prepared.levels} refinements led to the sizes"
-        )
     missing = mesh.missing_cells() if options.n_cells is None else float(options.n_cells - n)
-    near = is_near(prepared.setup.domain.cell_dim, options.effort, n, missing, mean, quality)
+    near = not prepared.levels and is_near(prepared.setup.domain.cell_dim, options.effort, n, missing, mean, quality)
     off = f"{abs(missing) / n:.1%} of the cells too {'few' if missing > 0 else 'many'}"
     found = f"mean |e| {mean:.2g}, {off}, mean Q {quality:.3f}"
     if near:
         return GivenPoints(near=True, why=f"the given mesh is near and only corrected ({found})")
+    if options.levels == "auto" and (after := without_far(prepared)) is not prepared:
+        kept = 0 if after.kept_rows is None else np.count_nonzero(after.kept_rows >= 0)
+        share = f"{1 - kept / len(prepared.points):.0%} of the given points are" if kept else "the given points are all"
+        return GivenPoints(replaced=True, why=f"{share} far from the sizes, and were replaced ({found})")
+    if prepared.levels:
+        return GivenPoints(
+            why=f"the given points are too few to be corrected: {prepared.levels} refinements led to the sizes"
+        )
     return GivenPoints(
         why=f"the given mesh is not near, and all steps were taken ({found}; near means at most {NEAR_ERROR:g}, "
         f"{NEAR_COUNT:.0%}, and regular cells)"
     )
 
 
-def plan(prepared: Prepared, near: bool) -> Plan:
-    """Return the schedule of the run; `near`: it only corrects the mesh of the caller."""
+def plan(prepared: Prepared, given: GivenPoints) -> Plan:
+    """Return the schedule of the run, which uses the points of the caller as `given`."""
     options, levels, domain = prepared.options, prepared.levels, prepared.setup.domain
     if not options.multilevel:
         relaxation = Relaxation(options.alpha, options.k)
         steps = STEPS if options.max_steps is None else options.max_steps
         method = make_method(options.method, relaxation, prepared.lattice, options.tol)
         return Plan(repeated_schedule(method, steps))
+    near = given.near
     dim, effort, steep = domain.cell_dim, options.effort, _steepness(prepared)
     smooth = choose_error_target(dim, effort, levels, near)
     target = options.error_target or choose_error_target(dim, effort, levels, near, steep)
@@ -464,10 +491,10 @@ def plan(prepared: Prepared, near: bool) -> Plan:
         levels,
         options.method in ("exact", "transport"),
         target,
-        warm=prepared.points is not None,
-        near=near,
+        begins=_beginning(prepared, given),
         openings=OPENINGS if domain.for_c_grids else 0,
         narrow_parts=domain.cuts_cells,
+        most=options.max_steps,
     )
     if options.method == "transport":
         schedule += [Prescribe(), *[Prescribe(move=True)] * MOVES]
@@ -479,6 +506,12 @@ def plan(prepared: Prepared, near: bool) -> Plan:
     else:
         trade += f" in place of {smooth:.2g}, for cells of a better shape: sizes are steep for {steep:.0%} of them"
     return Plan(schedule, target, trade)
+
+
+def _beginning(prepared: Prepared, given: GivenPoints) -> Begins:
+    if prepared.points is None:
+        return "random"
+    return "near" if given.near else "partly random" if given.replaced else "mesh"
 
 
 def _steepness(prepared: Prepared) -> float:

@@ -43,7 +43,7 @@ from .options import Checkpoint, Options, uses
 from .plan.actions import CorrectCount, Refine, Step
 from .plan.efforts import EFFORTS
 from .plan.schedule import work_of
-from .preparation import GivenPoints, Plan, Prepared, judge_points, plan, prepare, start
+from .preparation import GivenPoints, Plan, Prepared, judge_points, plan, prepare, start, without_far
 from .stages import Stages
 from .tuning import REACHED, RENEWAL, WINDOW
 
@@ -157,11 +157,15 @@ class Run:
         if saved is not None:
             stages.engine.peers.agree(lambda: saved.check_fingerprint(fingerprint))
             max_levels, given = saved.levels, saved.given
-        used = None if given is not None and given.replaced else points
+
+        def prepared_run() -> Prepared:
+            made = prepare(stages, self._domain, size, points, options, max_levels, self._fixed)
+            return without_far(made, max_levels) if given is not None and given.replaced else made
+
         prepared = stages.engine.peers.agree(
-            lambda: prepare(stages, self._domain, size, used, options, max_levels, self._fixed),
+            prepared_run,
             lambda made: {
-                **run_fingerprint(self._domain, vars(options), stages.engine.real, used, self._fixed),
+                **run_fingerprint(self._domain, vars(options), stages.engine.real, points, self._fixed),
                 "cells": made.target,
                 "levels": made.levels,
                 "cells for the size field": made.required,
@@ -185,7 +189,7 @@ class Run:
                 return
         self.given = given
         self._size, self._points = size, points
-        planned = plan(prepared, given.near)
+        planned = plan(prepared, given)
         self._writer = None
         if files.path is not None:
             path, peers = files.path, stages.engine.peers
@@ -202,7 +206,7 @@ class Run:
         multilevel = self._options.multilevel
         self.schedule, self.target = planned.schedule, float(prepared.target)
         self.levels = self.level = prepared.levels
-        self._kept_rows = prepared.kept_rows
+        self._origins = prepared.origins
         self.n_cells = self._options.n_cells if multilevel else None
         self._tol = None if multilevel else self._options.tol
         self.n_start, self.started = self.state.total, self.state.next_label
@@ -227,7 +231,7 @@ class Run:
         options = self._options
         settings = {
             **vars(options),
-            "start": options.start if self._points is None or self.given.replaced else "points",
+            "start": options.start if self._origins is None else "points",
             "levels": self.levels,
             "error_target": planned.error_target,
             "dtype": self._stages.engine.real.name,
@@ -513,10 +517,10 @@ class Run:
         size = mesh.to_host(mesh.h, mesh.domain.frame[1])
         error, quality = mesh.to_host(mesh.error), mesh.to_host(mesh.quality)
         origin, fixed = origins(labels, self.started, mesh.taken), mesh.setup.points
-        if self.given.replaced:
+        if self._origins is not None:
+            origin = np.where(origin < 0, -1, self._origins[origin])
+        elif self._points is not None:
             origin = np.full_like(origin, -1)
-        elif self._kept_rows is not None:
-            origin = np.where(origin < 0, -1, self._kept_rows[origin]).astype(np.int32)
         parts = None
         if self._is_part:
             parts = ResultParts(mesh.engine, self._domain, CellRows.of(mesh.t, mesh.labels))

@@ -8,8 +8,9 @@ Lengths are over h, the target size, unless they say otherwise. e is the error o
 
 NEAR_ERROR, NEAR_COUNT = 0.15, 0.02
 """Mean |e|, and share of missing cells, up to which a given mesh is only corrected."""
-USELESS_ERROR = 0.6
-"""Mean |e| above which a given mesh is replaced by a new one; that of random points is below it."""
+FAR, STRETCH = 1.6, 16.0
+"""Ratio of lengths from which given points are far from the sizes and replaced, and points that are counted together,
+given and expected ones."""
 DEFICIT_3D = 0.36
 """1 - mean Q in 3D up to which a given mesh counts as smoothed."""
 WALL_DEFICIT = 0.49

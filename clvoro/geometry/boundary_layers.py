@@ -431,9 +431,8 @@ def beyond_layers(domain: Domain, layers: Sequence[Layers], points: np.ndarray) 
 
 
 def apart_from(points: np.ndarray, rows: np.ndarray, free: Domain) -> np.ndarray:
-    """Return the `points` (n, 2) that lie in the `free` domain and differ from all `rows` (k, 2)."""
-    apart = free.contains(points) & (scipy.spatial.KDTree(rows).query(points)[0] > 0)
-    return points[apart]
+    """Return for each of `points` (n, 2) whether it lies in the `free` domain and differs from all `rows` (k, 2)."""
+    return np.asarray(free.contains(points) & (scipy.spatial.KDTree(rows).query(points)[0] > 0))
 
 
 def check_gaps(domain: Domain, layers: Sequence[Layers]) -> None:

@@ -150,5 +150,5 @@ def test_only_narrow_parts_in_the_plane_are_balanced(levels):
         assert [schedule[k + 1] for k in at[:levels]] == [Refine()] * len(at[:levels])
         repairs = [isinstance(schedule[k - 1], RepairCells) for k in at[levels:]]
         assert repairs == [False, True, True, True][: len(repairs)]
-        near = adaptive_schedule(dim, "default", 0, True, near=True, narrow_parts=narrow)
+        near = adaptive_schedule(dim, "default", 0, True, begins="near", narrow_parts=narrow)
         assert near.count(BalanceCounts()) == min(expected, 1)

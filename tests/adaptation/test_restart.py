@@ -6,10 +6,11 @@ import pytest
 import clvoro
 from clvoro import Box, sizing
 from clvoro.adaptation.plan.efforts import EFFORTS, is_near
-from clvoro.adaptation.plan.schedule import adaptive_schedule
+from clvoro.adaptation.plan.schedule import adaptive_schedule, n_steps
 
 BOXES = {2: Box((0, 0), (1, 0.8)), 3: Box((0, 0, 0), (1, 0.8, 0.7))}
-SHORT = {dim: len(adaptive_schedule(dim, "default", 0, False, warm=True, near=True)) for dim in (2, 3)}
+FITTED = {n: n_steps(adaptive_schedule(2, "default", 0, False, begins="mesh", most=n)) for n in (None, 40)}
+SHORT = {dim: len(adaptive_schedule(dim, "default", 0, False, begins="near")) for dim in (2, 3)}
 
 
 def field(dim, moved=0.0, factor=1.0):
@@ -78,13 +79,14 @@ def test_same_field_again_keeps_the_mesh(adapter, first):
 
 
 def test_other_points_take_the_full_schedule(adapter, first):
-    """Random points, and a good mesh with another number of cells."""
-    n = len(first[2].points)
-    box = BOXES[2]
+    """Random points, and a good mesh with another number of cells. Fewer steps leave out sweeps, not the last steps."""
+    box, n = BOXES[2], len(first[2].points)
     random = box.lower + box.extent * np.random.default_rng(553).random((n, 2))
     for points, size in ((random, field(2)), (first[2].points, field(2, factor=0.9))):
-        result = adapter.run(box, size, points=points, max_steps=SHORT[2] + 5)
-        assert result.history["step"][-1] == SHORT[2] + 5
+        result = adapter.run(box, size, points=points, max_steps=40)
+        assert result.history["step"][-1] == FITTED[40]
+        assert result.stop_reason == "plan completed"
+        assert np.abs(result.size_error).mean() < 0.01
 
 
 def test_held_count(adapter, first):
@@ -128,21 +130,61 @@ def test_the_result_says_whether_it_was_corrected_and_why(ctx):
     assert near.summary()["steps"] < far.summary()["steps"]
 
 
-def test_a_mesh_far_from_the_sizes_is_replaced(ctx, tmp_path):
-    """Its fine cells are elsewhere: there is no path on one level from them to good cells of the right sizes."""
-    box, adapter, state = clvoro.Box((0, 0), (4, 1)), clvoro.Adapter(ctx), tmp_path / "state"
-    there, here = (sizing.Distance(sizing.Circle((x, 0.5), 0.1), 0.03, slope=0.3, h_max=0.3) for x in (0.5, 3.5))
-    points = adapter.run(box, there, "fast").points
-    one = clvoro.MultilevelOptions(levels=0)
-    new, kept = adapter.run(box, here, "fast"), adapter.run(box, here, "fast", points=points, options=one)
+FAR_BOX = clvoro.Box((0, 0), (4, 1))
+
+
+def far_field(x):
+    return sizing.Distance(sizing.Circle((x, 0.5), 0.1), 0.03, slope=0.3, h_max=0.3)
+
+
+def test_points_far_from_the_sizes_are_replaced(ctx, tmp_path):
+    """The fine cells are elsewhere. Points between them, which have about the right number, stay."""
+    adapter, state = clvoro.Adapter(ctx), tmp_path / "state"
+    points = adapter.run(FAR_BOX, far_field(0.5), "fast").points
+    new = adapter.run(FAR_BOX, far_field(3.5), "fast")
     every = {"points": points, "checkpoint": clvoro.Checkpoint(state, every=0)}
-    whole = adapter.run(box, here, "fast", **every)
-    adapter.run(box, here, "fast", callback=lambda row: row["step"] == 6, **every)
-    rest = adapter.run(box, here, "fast", points=points, checkpoint=clvoro.Checkpoint(resume=state))
-    assert (kept.origin >= 0).any()
-    assert np.abs(whole.size_error).mean() < 2 * np.abs(new.size_error).mean()
+    whole = adapter.run(FAR_BOX, far_field(3.5), "fast", **every)
+    adapter.run(FAR_BOX, far_field(3.5), "fast", callback=lambda row: row["step"] == 6, **every)
+    rest = adapter.run(FAR_BOX, far_field(3.5), "fast", points=points, checkpoint=clvoro.Checkpoint(resume=state))
+    assert np.abs(whole.size_error).mean() < 1.5 * np.abs(new.size_error).mean()
+    assert whole.quality.mean() > new.quality.mean() - 0.01
+    assert whole.history["mean_error"][0] < 0.5
+    kept = whole.origin >= 0
+    # Those around the old circle are not there any more, and those far from both have hardly moved.
+    assert (np.linalg.norm(points[whole.origin[kept]] - [0.5, 0.5], axis=1) > 0.1).mean() > 0.9
+    assert 0.05 < kept.mean() < 0.6
+    moved = np.linalg.norm(whole.points[kept] - points[whole.origin[kept]], axis=1) / whole.target_size[kept]
+    assert np.median(moved) < 2
     for result in (whole, rest):
         np.testing.assert_array_equal(result.points, whole.points)
-        assert result.settings["path"].startswith("the given mesh is far from the sizes, and a new one was made")
-        assert result.settings["start"] == "density"
-        assert (result.origin == -1).all()
+        np.testing.assert_array_equal(result.origin, whole.origin)
+        assert "of the given points are far from the sizes, and were replaced" in result.settings["path"]
+        assert result.settings["start"] == "points"
+
+
+def test_levels_that_are_given_keep_all_points(ctx):
+    adapter = clvoro.Adapter(ctx)
+    points = adapter.run(FAR_BOX, far_field(0.5), "fast").points
+    one = clvoro.MultilevelOptions(levels=0)
+    kept = adapter.run(FAR_BOX, far_field(3.5), "fast", points=points, options=one, max_steps=2)
+    assert (kept.origin >= 0).mean() > 0.9
+    # Without them, points in a corner are all replaced, and the mesh is that of a run without points.
+    corner = 0.01 + 0.05 * np.random.default_rng(4).random((300, 2))
+    again, new = (adapter.run(FAR_BOX, far_field(3.5), "fast", points=x) for x in (corner, None))
+    np.testing.assert_array_equal(again.points, new.points)
+    assert (again.origin == -1).all()
+    assert again.settings["path"].startswith("the given points are all far from the sizes, and were replaced")
+
+
+def test_a_front_that_moves_far_keeps_its_quality(ctx):
+    """Of a front that moves by many widths again and again, each mesh is as good as the first one after 21 steps."""
+    adapter = clvoro.Adapter(ctx)
+    run = adapter.start(FAR_BOX, far_field(0.5), "fast", max_steps=21)
+    first = adapter.run(FAR_BOX, far_field(0.5), "fast")
+    for x in (1.2, 2.4, 3.6):
+        run.finish()
+        run.follow(far_field(x))
+        after = run.finish()
+        assert int(after.history["step"][-1]) <= 21
+        assert np.abs(after.size_error).mean() < 0.01
+        assert after.quality.mean() > first.quality.mean() - 0.025

@@ -24,7 +24,8 @@ In 3D there is no lattice with dislocations. Each level glides, then polishes:
 
 *correct count ahead*  to the number from which refinement gives that of the next level, where it seldom has to change
 
-From a mesh that is close to its size field, for instance after the field has moved by a few cells:
+Given points that are far from the sizes are replaced by those of a density start, and the finest level begins with
+them. From a mesh that is close to its size field, for instance after the field has moved by a few cells:
 
     stride ─► correct count ─► stride ─► correct ─► correct count ─► polish (─► project)
 
@@ -37,6 +38,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import replace
+from typing import Literal
 
 from ..methods import ProjectedMethod, WeightedMethod
 from ..motion import Method
@@ -95,6 +97,8 @@ from .actions import (
 )
 from .efforts import EFFORTS_OF, Effort, choose_error_target
 
+Begins = Literal["random", "mesh", "partly random", "near"]
+"""With what a run begins; see `adaptive_schedule`."""
 COUPLE = WeightedMethod(cautious=True, tolerance=0.2, max_cycles=1)
 """Weighted steps after refinement, and all in 3D: one cycle of multigrid; the next steps reduce what remains."""
 
@@ -115,10 +119,10 @@ def adaptive_schedule(
     levels: int,
     exact: bool,
     error_target: float | None = None,
-    warm: bool = False,
-    near: bool = False,
+    begins: Begins = "random",
     openings: int = 0,
     narrow_parts: bool = False,
+    most: int | None = None,
 ) -> list[Action]:
     """Return the schedule of the methods "adaptive" and "exact", with `levels` coarser levels.
 
@@ -130,10 +134,9 @@ def adaptive_schedule(
         End with the exact projection.
     error_target : float, optional
         By default that of `choose_error_target` for smooth sizes.
-    warm : bool
-        The start is a mesh, not a random sample.
-    near : bool
-        It only needs a correction (see `is_near`). There are no coarser levels then.
+    begins : "random", "mesh", "partly random" or "near"
+        The start is a random sample, a mesh, one with random points in place of some, or one that only needs a
+        correction (see `is_near`). In the last case there are no coarser levels.
     openings : int
         How often the last steps open obtuse triangles, at most. Some steps before them cells of four sides are deleted,
         and those of eight split: a cell of four sides has an obtuse triangle.
@@ -141,8 +144,26 @@ def adaptive_schedule(
         The domain, in 2D, may have parts that few cells join. The number of cells in each part is then balanced before
         each refinement, which multiplies what a part lacks, before polishing, and after each repair. The penalty of
         exact projections falls step by step (see `GRADUAL_PENALTIES`).
+    most : int, optional
+        Number of steps for which sweeps, and in 3D steps of the first polishing, are left out, from a mesh and without
+        coarser levels. The last steps, which polish, are not.
     """
-    schedule = _several_kinds(dim, effort, levels, exact, error_target, warm, near)
+    if error_target is None:
+        error_target = choose_error_target(dim, effort, levels, begins == "near")
+
+    def planned(effort: Effort) -> list[Action]:
+        if begins == "near":
+            return list(_correction(dim, effort, exact, error_target))
+        return list({2: _adaptive_2d, 3: _adaptive_3d}[dim](effort, levels, exact, error_target, begins))
+
+    settings = EFFORTS_OF[dim][effort]
+    schedule = planned(settings)
+    while most is not None and begins != "random" and levels == 0 and n_steps(schedule) > most:
+        name = "alone" if settings.alone else "coarse_polish"
+        if not getattr(settings, name):
+            break
+        settings = replace(settings, **{name: getattr(settings, name) - 1})
+        schedule = planned(settings)
     projections = EXACT_STEPS if exact else 0
     if narrow_parts:
         polish = schedule.index(ResetMomentum()) - 1
@@ -184,19 +205,13 @@ def _opened(schedule: list[Action], exact: int, openings: int) -> list[Action]:
     return [*schedule[:before], *repair, *schedule[before:]]
 
 
-def _several_kinds(
-    dim: int, effort: str, levels: int, exact: bool, error_target: float | None, warm: bool, near: bool
-) -> list[Action]:
-    settings = EFFORTS_OF[dim][effort]
-    if error_target is None:
-        error_target = choose_error_target(dim, effort, levels, near)
-    if near:
-        return list(_correction(dim, settings, exact, error_target))
-    adaptive = {2: _adaptive_2d, 3: _adaptive_3d}[dim]
-    return list(adaptive(settings, levels, exact, error_target, warm))
+def n_steps(schedule: list[Action]) -> int:
+    """Return the number of steps in a schedule."""
+    return sum(isinstance(action, Step) for action in schedule)
 
 
-def _adaptive_2d(effort: Effort, levels: int, exact: bool, error_target: float, warm: bool) -> Iterator[Action]:
+def _adaptive_2d(effort: Effort, levels: int, exact: bool, error_target: float, begins: Begins) -> Iterator[Action]:
+    warm = begins != "random"
     glide = ProjectedMethod(
         "lloyd",
         effort.relaxation,
@@ -309,7 +324,8 @@ def _finish_2d(effort: Effort, exact: bool, error_target: float, penalty: float)
         yield from [Step(separate)] * effort.separate
 
 
-def _adaptive_3d(effort: Effort, levels: int, exact: bool, error_target: float, warm: bool) -> Iterator[Action]:
+def _adaptive_3d(effort: Effort, levels: int, exact: bool, error_target: float, begins: Begins) -> Iterator[Action]:
+    warm = begins != "random"
     couple = [Step(COUPLE)]
     coarse_glide = _glide_3d(effort, COARSE_PENALTY, COARSE_TOLERANCE)
     coarse_polish = _polish_3d(effort, COARSE_PENALTY, COARSE_TOLERANCE)
@@ -325,7 +341,7 @@ def _adaptive_3d(effort: Effort, levels: int, exact: bool, error_target: float, 
                 yield from couple * steps
                 yield CorrectCount(COUNT_LEAST, POLISH_GROWTH_3D)
             yield from couple * effort.recouple
-        if level or not (levels or warm):
+        if level or (not levels and begins != "mesh"):
             yield from [Step(coarse_glide)] * (effort.coarse_glide if levels else effort.alone)
             yield from [Step(coarse_polish)] * effort.coarse_polish
             yield ResetMomentum()

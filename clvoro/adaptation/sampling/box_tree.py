@@ -127,6 +127,11 @@ class BoxTree:
         at = np.searchsorted(starts[order], self._keys(places), side="right") - 1
         return order[at]
 
+    def find_points(self, points: np.ndarray) -> np.ndarray:
+        """Return the index (n,) of the box that contains, or is next to, each of the physical `points` (n, d)."""
+        places = (points - self.origin) / self.root
+        return self.find(np.clip(places, 0, self.end - 2.0 ** -(self.deepest + 1)))
+
     def _keys(self, places: np.ndarray) -> np.ndarray:
         """Return Morton keys of `places` (n, d)."""
         whole = np.floor(places * 2.0**self.deepest).astype(np.uint64)

@@ -12,6 +12,7 @@ from numpy.typing import DTypeLike
 from ...errors import InputError, InputTypeError
 from ...geometry.domain import Domain
 from ...sizing import as_field
+from ..tuning import FAR, STRETCH
 from .box_tree import BoxTree
 from .coverage import CutCoverage, coverage_of
 from .quadrature import DensityTree
@@ -127,13 +128,51 @@ def sample_density(
     (n, d) float64
         Physical coordinates, distinct and strictly inside, in the order of the curve.
     """
+    return replace_far(np.empty((0, domain.dim)), field, domain, n, seed, real, tree)[0]
+
+
+def replace_far(
+    points: np.ndarray,
+    field: Callable[[np.ndarray], np.ndarray] | float,
+    domain: Domain,
+    n: int,
+    seed: int,
+    real: DTypeLike | None = None,
+    tree: DensityTree | None = None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return `points`, replaced by those of `sample_density` where their number is far from that of the density.
+
+    The boxes of `sample_density` are divided along the curve into stretches of `STRETCH` points, given and expected
+    ones. Where one number is more than ``FAR**d`` times the other, the expected points replace the given ones.
+
+    Parameters
+    ----------
+    points : (k, d) float64
+        Inside the domain.
+    field, domain, n, seed, real, tree
+        As for `sample_density`.
+
+    Returns
+    -------
+    (m, d) float64
+        Those of `points` that are kept, then new ones. Without points, or if none is kept, these are the `n` points of
+        `sample_density`.
+    (l,) int
+        Rows of the kept ones in `points`.
+
+    Raises
+    ------
+    SizeFieldError, InputError
+        As for `sample_density`.
+    """
     n, seed = _check_arguments(n, seed)
     field = _evaluator(field)
     tree = density_tree(field, domain) if tree is None else tree
     chart = domain.chart()
     if chart.domain is not domain:
         _, field = charted(domain, field)
-        return chart.position(sample_density(field, chart.domain, n, seed, real, tree))
+        found, rows = replace_far(chart.place(points), field, chart.domain, n, seed, real, tree)
+        return np.concatenate([points[rows], chart.position(found[len(rows) :])]), rows
     boxes, coverage, slopes = tree.boxes, tree.coverage, tree.slopes
     share = tree.cells * (n / tree.integral)
     while (chosen := (share > _MAX_EXPECTED) & (boxes.level < 45)).any():
@@ -142,14 +181,32 @@ def sample_density(
     rng = np.random.Generator(np.random.PCG64(seed))
     marks = (np.arange(n) + rng.random()) * (reached[-1] / n)
     box = np.minimum(np.searchsorted(reached, marks, side="right"), len(boxes) - 1)
+    inside = boxes.find_points(points)
+    far = _are_far(share, np.bincount(inside, minlength=len(boxes)), domain.dim)
+    rows = np.flatnonzero(~far[inside])
+    box = box[far[box]] if len(points) else box
 
-    def draw(rows: np.ndarray, attempt: int) -> np.ndarray:
-        mine = box[rows]
+    def draw(wanted: np.ndarray, attempt: int) -> np.ndarray:
+        mine = box[wanted]
         slope = slopes[mine] * coverage.relative_edges(mine)
-        return coverage.draw(_log_linear(rng.random((len(rows), domain.dim)), slope), mine, attempt)
+        return coverage.draw(_log_linear(rng.random((len(wanted), domain.dim)), slope), mine, attempt)
 
     precision = getattr(field, "real", np.float64) if real is None else real
-    return _distinct(draw, domain, n, np.dtype(precision))
+    return _in_all_pieces(domain, _distinct(draw, domain, len(box), np.dtype(precision), points[rows])), rows
+
+
+def _are_far(expected: np.ndarray, given: np.ndarray, dim: int) -> np.ndarray:
+    """Return for each box whether the number of points in its stretch of the curve is far from the expected one.
+
+    Parameters
+    ----------
+    expected, given : (m,) float
+        Number of points in each box, in the order of the curve.
+    """
+    both = expected + given
+    stretch = ((np.cumsum(both) - both) / STRETCH).astype(int)
+    needs, has = np.bincount(stretch, expected), np.bincount(stretch, given)
+    return ((has > FAR**dim * needs) | (needs > FAR**dim * has))[stretch]
 
 
 def sample_uniform(domain: Domain, n: int, seed: int, real: DTypeLike = np.float64) -> np.ndarray:
@@ -181,7 +238,7 @@ def sample_uniform(domain: Domain, n: int, seed: int, real: DTypeLike = np.float
         del attempt
         return place(len(rows))
 
-    return _distinct(draw, domain, n, np.dtype(real))
+    return _in_all_pieces(domain, _distinct(draw, domain, n, np.dtype(real)))
 
 
 @runtime_checkable
@@ -248,18 +305,29 @@ def _log_linear(u: np.ndarray, slope: np.ndarray) -> np.ndarray:
     return np.where(flat, u, np.log1p(u * np.expm1(safe)) / safe)
 
 
-def _distinct(draw: Callable[[np.ndarray, int], np.ndarray], domain: Domain, n: int, real: np.dtype) -> np.ndarray:
-    """Draw points. Repeat those that coincide or are on a wall in precision `real`."""
+def _distinct(
+    draw: Callable[[np.ndarray, int], np.ndarray],
+    domain: Domain,
+    n: int,
+    real: np.dtype,
+    kept: np.ndarray | None = None,
+) -> np.ndarray:
+    """Return the points `kept` and `n` others. Where some coincide or are on a wall in precision `real`, draw again.
+
+    `draw(wanted, attempt)` returns new points for the rows `wanted` among the n.
+    """
     origin, scale = domain.frame
-    points = np.empty((n, domain.dim))
-    rows, inside = np.arange(n), np.zeros(n, bool)
+    first = 0 if kept is None else len(kept)
+    points = np.empty((first + n, domain.dim))
+    points[:first] = kept if first else 0
+    rows, bad = np.arange(first, first + n), np.zeros(first + n, bool)
     for attempt in range(_ATTEMPTS):
-        points[rows] = draw(rows, attempt)
+        points[rows] = draw(rows - first, attempt)
         working = ((points - origin) / scale).astype(real)
-        inside[rows] = _strictly_inside(domain, points[rows], working[rows])
-        rows = np.flatnonzero(~inside | _repeated(working))
+        bad[rows] = ~_strictly_inside(domain, points[rows], working[rows])
+        rows = first + np.flatnonzero((bad | _repeated(working))[first:])
         if not rows.size:
-            return _in_all_pieces(domain, points)
+            return points
     raise InputError(
         f"n is {n}, but {real.name} has not as many distinct points for this size field; "
         + ("use dtype='float64' or " if real != np.float64 else "")
