@@ -1,6 +1,6 @@
 """A front that moves with the flow, on a mesh that follows it: error, conservation, extrema, and the number of cells.
 
-    python bench/following.py [--cells 1000,2000] [--cycles 50] [--uniform 1000,4000,16000] [--steps 20] [--width 0.02]
+    python bench/following.py [--cells 1000,2000] [--cycles 50] [--uniform 1000,4000,16000] [--steps 21] [--width 0.02]
                               [--picture FILE] [--device NAME] [--json]
 
 A disk with a smooth rim of the given width turns once around the middle of a square, in `--cycles` parts. After each
@@ -204,7 +204,7 @@ def main(arguments: list[str] | None = None) -> int:
     made.add_argument("--cells", type=counts, default=counts("1000,2000"))
     made.add_argument("--cycles", type=int, default=50)
     made.add_argument("--uniform", type=counts, default=counts("1000,4000,16000"))
-    made.add_argument("--steps", type=int, default=20)
+    made.add_argument("--steps", type=int, default=21)
     made.add_argument("--width", type=float, default=0.02)
     made.add_argument("--picture", type=Path, metavar="FILE")
     options = made.parse_args(arguments)

@@ -360,7 +360,7 @@ def _count_levels(setup: Setup, points: np.ndarray | None, target: int, n_rows: 
     d = domain.cell_dim
     if levels == "auto":
         if points is not None:
-            return max(0, round(math.log2(target / len(points)) / d))
+            return max(0, round(math.log2(max(target - n_rows, 1) / len(points)) / d))
         levels = auto_levels(target - n_rows, d)
         while levels and n_rows and _is_narrow(setup, 2**levels):
             levels -= 1

@@ -107,8 +107,8 @@ class Result(Sealed, MeshOutput):
         ``full_share``, the share of the wall's area where it is at least 0.9 of that.
     origin : (n,) int32 or None
         Index of each generator in the points with which the run began, of a fixed one that of the point whose place it
-        has taken; -1 for inserted generators, which come last. All are -1 if a random start has replaced the points,
-        because their cells were far from the target sizes.
+        has taken; -1 for inserted generators, which come last, for those of layers, and for those that have replaced
+        given points far from the target sizes.
     parts : ResultParts or None
         Over the ranks of MPI: what `gather` needs. The arrays above are then those of the cells of this rank, and faces
         towards the cells of rank K are on a wall called ``"rankK"``, such as ``"rank1"``.

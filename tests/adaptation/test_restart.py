@@ -162,6 +162,18 @@ def test_points_far_from_the_sizes_are_replaced(ctx, tmp_path):
         assert result.settings["start"] == "points"
 
 
+def test_points_beside_layers_keep_their_numbers(ctx):
+    """`origin` counts the points of the caller, among which are those of layers. These are placed anew."""
+    adapter, layers = clvoro.Adapter(ctx), [clvoro.Layers(0.02, count=2)]
+    mesh = adapter.run(FAR_BOX, 0.1, "fast", layers=layers)
+    again = adapter.run(FAR_BOX, 0.1, "fast", points=mesh.points, layers=layers)
+    kept = again.origin >= 0
+    assert 0.4 < kept.mean() < 0.9
+    moved = np.linalg.norm(again.points[kept] - mesh.points[again.origin[kept]], axis=1)
+    assert np.median(moved) < 0.02
+    assert again.settings["path"].startswith("the given mesh is near")
+
+
 def test_levels_that_are_given_keep_all_points(ctx):
     adapter = clvoro.Adapter(ctx)
     points = adapter.run(FAR_BOX, far_field(0.5), "fast").points
