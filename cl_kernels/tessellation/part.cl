@@ -22,8 +22,8 @@ inline REAL weight_of_face(int a, int b)
 /* Radius of the ball around generator i in which its part must know all generators. The radius is `factor` times the
    reach of the cell. If the cells of ghosts must be final, too (`with_ghosts`), the ball also contains the balls of the
    ghosts beside the cell. */
-inline REAL needed_radius(int i, int n, int with_ghosts, REAL factor, global const int *starts,
-                          global const int *neighbors, global const float *reach, global const REAL *points)
+inline REAL certified_radius(int i, int n, int with_ghosts, REAL factor, global const int *starts,
+                             global const int *neighbors, global const float *reach, global const REAL *points)
 {
     REAL radius = factor * reach[i];
     for (int k = with_ghosts ? starts[i] : starts[i + 1]; k < starts[i + 1]; ++k) {
@@ -60,7 +60,7 @@ kernel void sum_cells(const int size, const int n, global const int *starts, glo
             moved2 += d * d;
         }
         const REAL moved = sqrt(moved2);
-        const REAL radius = needed_radius(i, n, with_ghosts, factor, starts, neighbors, reach, points);
+        const REAL radius = certified_radius(i, n, with_ghosts, factor, starts, neighbors, reach, points);
         needed[i] = (float)(radius * (1 + R(1e-6)));
         beyond += !(radius + moved <= limits[i].s0 && moved <= limits[i].s1);
         volume += volumes[i];
