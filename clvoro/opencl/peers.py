@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
 Made = TypeVar("Made")
-PATIENCE, NAPS = 5, (1e-4, 2e-3)
+PATIENCE, NAPS = 2, (1e-4, 2e-3)
 """A rank that waits for a message first asks for it `PATIENCE` times without a pause. Then it sleeps before each
 question, since there may be more ranks than cores: for as long as it has waited so far, within the limits `NAPS` in
 seconds. To fall asleep and to wake up takes some 30 microseconds of processor time."""

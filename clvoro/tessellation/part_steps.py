@@ -32,14 +32,14 @@ from .polyhedra import Polyhedra
 from .stages import TessellationStages
 from .steps import DomainSteps, Sort
 
-FIRST_REACH = 2.0, 2.8
+FIRST_REACH = 1.9, 3.3
 """Radius of the first balls over the spacing of the generators around. The first number holds where only own cells must
 be final (3D), the second where the cells of neighboring ghosts must be final, too (2D)."""
 RUN = 32
 """Number of successive generators from which their spacing is estimated."""
 JUMP = 8
 """A new chunk begins where two successive generators are more than so many spacings apart."""
-GROWTH, SKIN = 1.2, 0.15
+GROWTH, SKIN = 1.4, 0.15
 """Radius of the balls of a part, over that of the balls that its cells need. Width of the skin around each ball, as a
 share of this radius: a part asks for the generators in the skin, too, because they may move into the ball."""
 NEAR, FREE = 1.6, 0.8
