@@ -23,20 +23,14 @@ DONE, PIECE_LARGE, FAILED = range(3)
 
 @dataclass(frozen=True)
 class Space:
-    """The coordinates in which two meshes are intersected.
-
-    Attributes
-    ----------
-    origin, scale : (d,) float64, float
-        A position x has the coordinates (x - origin) / scale.
-    lower, upper : (d,) float64
-        Corners of a box around all cells, in these coordinates.
-    """
+    """The coordinates in which two meshes are intersected."""
 
     origin: np.ndarray
     scale: float
+    """`origin`, `scale`: (d,) float64, float. A position x has the coordinates (x - origin) / scale."""
     lower: np.ndarray
     upper: np.ndarray
+    """`lower`, `upper`: (d,) float64. Corners of a box around all cells, in these coordinates."""
 
     def place(self, x: np.ndarray) -> np.ndarray:
         """Return the coordinates of positions."""
@@ -51,59 +45,40 @@ class Space:
 
 @dataclass(frozen=True)
 class PieceArrays:
-    """Pieces on the device.
-
-    Attributes
-    ----------
-    args : tuple
-        PIECES_ARGS of `transfer.cl`.
-    """
+    """Pieces on the device."""
 
     pieces: Pieces
     args: tuple[cla.Array, ...]
+    """PIECES_ARGS of `transfer.cl`."""
 
 
 @dataclass(frozen=True)
 class PieceMeasures:
-    """Measures of pieces on the host, in the coordinates of the `Space`.
-
-    Attributes
-    ----------
-    volumes, centroids : (k,), (k, d) float64
-        On a sphere centroids are means of the position, inside of it.
-    lower, upper : (k, d) float64
-        Corners of a box around each piece.
-    """
+    """Measures of pieces on the host, in the coordinates of the `Space`."""
 
     volumes: np.ndarray
     centroids: np.ndarray
+    """`volumes`, `centroids`: (k,), (k, d) float64. On a sphere centroids are means of the position, inside of it."""
     lower: np.ndarray
     upper: np.ndarray
+    """`lower`, `upper`: (k, d) float64. Corners of a box around each piece."""
 
 
 @dataclass(frozen=True)
 class CellData:
-    """Data of the old cells, on the device.
-
-    Attributes
-    ----------
-    cells : (k,) int32
-        The cell of each piece.
-    values : (n, width) real
-        Means over the cells.
-    least, most : (n, width) real
-        Bounds of the data inside a cell.
-    means : (n, d) real
-        Centroids; on a sphere means of the position.
-    slopes : (n, width, d) real or None
-    """
+    """Data of the old cells, on the device."""
 
     cells: cla.Array
+    """(k,) int32. The cell of each piece."""
     values: cla.Array
+    """(n, width) real. Means over the cells."""
     least: cla.Array
     most: cla.Array
+    """`least`, `most`: (n, width) real. Bounds of the data inside a cell."""
     means: cla.Array
+    """(n, d) real. Centroids; on a sphere means of the position."""
     slopes: cla.Array | None = None
+    """(n, width, d) real or None."""
 
     @property
     def kernel_args(self) -> tuple[object, ...]:
@@ -123,22 +98,15 @@ class CellData:
 
 @dataclass(frozen=True)
 class CellGraph:
-    """Neighbors of the old cells.
-
-    Attributes
-    ----------
-    starts, neighbors : (n + 1,), (m,) int
-        Negative neighbors are walls.
-    shifts : (m, d) int8
-        The neighbor is the image that many periods away.
-    periods : (d,) float64
-        In the coordinates of the `Space`.
-    """
+    """Neighbors of the old cells."""
 
     starts: np.ndarray
     neighbors: np.ndarray
+    """`starts`, `neighbors`: (n + 1,), (m,) int. Negative neighbors are walls."""
     shifts: np.ndarray
+    """(m, d) int8. The neighbor is the image that many periods away."""
     periods: np.ndarray
+    """(d,) float64. In the coordinates of the `Space`."""
 
 
 def transfer_bytes(engine: Engine, old: Pieces, new: Pieces, half_faces: int, width: int, order: int) -> float:

@@ -29,21 +29,15 @@ _LANDMARKS = 4096
 
 
 class _Tree(NamedTuple):
-    """A k-d tree: all leaves are at one depth, leaf k has the rows (k n) >> levels to ((k + 1) n) >> levels.
-
-    Attributes
-    ----------
-    levels : int
-    order : (n,) int
-        The points, leaf by leaf.
-    axes, splits : (2^levels - 1,) int and float
-        Axis and coordinate at which each node divides its points; the children of node k are 2 k + 1 and 2 k + 2.
-    """
+    """A k-d tree: all leaves are at one depth, leaf k has the rows (k n) >> levels to ((k + 1) n) >> levels."""
 
     levels: int
     order: np.ndarray
+    """(n,) int. The points, leaf by leaf."""
     axes: np.ndarray
     splits: np.ndarray
+    """`axes`, `splits`: (2^levels - 1,) int and float. Axis and coordinate at which each node divides its points; the
+    children of node k are 2 k + 1 and 2 k + 2."""
 
     @classmethod
     def of(cls, points: np.ndarray) -> _Tree:

@@ -100,22 +100,15 @@ class CodeWriter:
 
 
 class DeviceCode(NamedTuple):
-    """A size field as OpenCL.
-
-    Attributes
-    ----------
-    prelude : str
-        OpenCL text that defines ``REAL size_at(const REAL *x, __global const REAL *data)``: h' = h / scale at
-        x' = (x - origin) / scale. It is an argument of `Engine.kernels` and needs only DIM and REAL.
-    data : (m,) real
-        The argument `data` of `size_at`.
-    peak_bytes : int
-        Peak device memory of the computation.
-    """
+    """A size field as OpenCL."""
 
     prelude: str
+    """OpenCL text that defines ``REAL size_at(const REAL *x, __global const REAL *data)``: h' = h / scale at x' = (x -
+    origin) / scale. It is an argument of `Engine.kernels` and needs only DIM and REAL."""
     data: np.ndarray
+    """(m,) real. The argument `data` of `size_at`."""
     peak_bytes: int
+    """Peak device memory of the computation."""
 
 
 def generate_code(

@@ -25,22 +25,16 @@ _SMALLEST_PIVOT = {np.dtype(np.float64): 1e-10, np.dtype(np.float32): 1e-4}
 
 @dataclass(frozen=True)
 class CellStencils:
-    """The centroids of a mesh and their graph, without walls.
-
-    Attributes
-    ----------
-    mesh : Diagram
-    starts, neighbors : (n + 1,), (m,) int32
-    across : (m, d) float64
-        Vectors between the centroids of neighbors, across seams, too.
-    at_wall : (n,) bool
-    """
+    """The centroids of a mesh and their graph, without walls."""
 
     mesh: Diagram
     starts: np.ndarray
     neighbors: np.ndarray
+    """`starts`, `neighbors`: (n + 1,), (m,) int32."""
     across: np.ndarray
+    """(m, d) float64. Vectors between the centroids of neighbors, across seams, too."""
     at_wall: np.ndarray
+    """(n,) bool."""
 
     @classmethod
     def of(cls, mesh: object) -> CellStencils:

@@ -54,24 +54,16 @@ def check_bounds(what: str, h_min: object, h_max: object, longest: float) -> flo
 
 
 class Places(NamedTuple):
-    """Where the values of an indicator are: the cells of a mesh, or the pixels of a raster.
-
-    Attributes
-    ----------
-    volumes : array
-        Volume that each value represents.
-    dim : int
-        Number of dimensions of the cells.
-    longest : float
-        The largest size.
-    limit : callable, optional
-        Limits the growth of sizes. It makes none larger.
-    """
+    """Where the values of an indicator are: the cells of a mesh, or the pixels of a raster."""
 
     volumes: np.ndarray
+    """Volume that each value represents."""
     dim: int
+    """Number of dimensions of the cells."""
     longest: float
+    """The largest size."""
     limit: Callable[[np.ndarray], np.ndarray] | None = None
+    """Limits the growth of sizes. It makes none larger."""
 
 
 def best_sizes(

@@ -14,20 +14,14 @@ _ROUNDS = 60
 
 @dataclass(frozen=True)
 class Crossings:
-    """Points in which creases cross faces between two cells, sorted by the cells.
-
-    Attributes
-    ----------
-    cells : (x, 2) int
-        The two cells, the lower one first.
-    points : (x, 3) float
-    edge : (x,) int
-        Edge of the crease.
-    """
+    """Points in which creases cross faces between two cells, sorted by the cells."""
 
     cells: np.ndarray
+    """(x, 2) int. The two cells, the lower one first."""
     points: np.ndarray
+    """(x, 3) float."""
     edge: np.ndarray
+    """(x,) int. Edge of the crease."""
 
     def take(self, rows: np.ndarray) -> Crossings:
         """Return some of the crossings."""

@@ -111,17 +111,11 @@ class _RejectedCells:
 
 @dataclass(frozen=True)
 class _Layered:
-    """A mesh with layers.
-
-    Attributes
-    ----------
-    faces : Faces
-    wall : (m,) int
-        The wall polygon, among those with layers, of each prism.
-    """
+    """A mesh with layers."""
 
     faces: Faces
     wall: np.ndarray
+    """(m,) int. The wall polygon, among those with layers, of each prism."""
 
 
 class _LayeredWalls:

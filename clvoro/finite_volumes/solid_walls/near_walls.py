@@ -21,24 +21,18 @@ _RINGS = 2
 
 @dataclass(frozen=True)
 class CellFaces:
-    """Faces of cells that are closed.
-
-    Attributes
-    ----------
-    owner, neighbor : (f,) int
-    starts, corners : (f + 1,), (k,) int
-        Corners, counter-clockwise as seen from the neighbor.
-    points : (v, 3) float
-    row : (f,) int
-        The face of the diagram that each is.
-    """
+    """Faces of cells that are closed."""
 
     owner: np.ndarray
     neighbor: np.ndarray
+    """`owner`, `neighbor`: (f,) int."""
     starts: np.ndarray
     corners: np.ndarray
+    """`starts`, `corners`: (f + 1,), (k,) int. Corners, counter-clockwise as seen from the neighbor."""
     points: np.ndarray
+    """(v, 3) float."""
     row: np.ndarray
+    """(f,) int. The face of the diagram that each is."""
 
     def within(self, n: int) -> CellFaces:
         """Return the faces between two of the first `n` cells."""

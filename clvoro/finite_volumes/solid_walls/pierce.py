@@ -24,26 +24,20 @@ IN, WALL, OUT = -1, 0, 1
 
 @dataclass(frozen=True)
 class PiercedEdges:
-    """The parts of edges in a solid.
-
-    Attributes
-    ----------
-    starts_inside, ends_inside : (e,) bool
-        Whether the edge is inside, or on the surface, beside its first and its second end.
-    first : (e + 1,) int
-        Rows of the piercings of each edge; inside and outside alternate there.
-    edge : (p,) int
-    points : (p, 3) float
-    triangles : (p,) int
-        Where the piercings lie on the surface.
-    """
+    """The parts of edges in a solid."""
 
     starts_inside: np.ndarray
     ends_inside: np.ndarray
+    """`starts_inside`, `ends_inside`: (e,) bool. Whether the edge is inside, or on the surface, beside its first and
+    its second end."""
     first: np.ndarray
+    """(e + 1,) int. Rows of the piercings of each edge; inside and outside alternate there."""
     edge: np.ndarray
+    """(p,) int."""
     points: np.ndarray
+    """(p, 3) float."""
     triangles: np.ndarray
+    """(p,) int. Where the piercings lie on the surface."""
 
 
 def sides(distance: np.ndarray, h: np.ndarray) -> np.ndarray:

@@ -12,18 +12,13 @@ from .wall_surface import WallSurface
 
 @dataclass
 class WallPolygons:
-    """Faces of cells on the surface.
-
-    Attributes
-    ----------
-    cell, patch : list of int
-    loops : list of list of int
-        Corners, counter-clockwise as seen from outside of the cell.
-    """
+    """Faces of cells on the surface."""
 
     cell: list[int] = field(default_factory=list)
     patch: list[int] = field(default_factory=list)
+    """`cell`, `patch`: list of int."""
     loops: list[list[int]] = field(default_factory=list)
+    """list of list of int. Corners, counter-clockwise as seen from outside of the cell."""
 
     def add(self, cell: int, patch: int, loop: list[int]) -> None:
         """Add a face, unless it has no area."""

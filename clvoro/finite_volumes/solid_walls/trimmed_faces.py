@@ -13,23 +13,16 @@ from .wall_surface import WallSurface
 
 @dataclass(frozen=True)
 class TrimmedFaces:
-    """Parts of faces inside of the solid.
-
-    Attributes
-    ----------
-    face : (p,) int
-        The face that each part comes from; a face may have several.
-    starts : (p + 1,) int
-    items : (k,) int
-        Corners: vertices, and after these the piercings of edges.
-    chord : (k,) bool
-        Whether the part goes from this corner to the next one along the wall.
-    """
+    """Parts of faces inside of the solid."""
 
     face: np.ndarray
+    """(p,) int. The face that each part comes from; a face may have several."""
     starts: np.ndarray
+    """(p + 1,) int."""
     items: np.ndarray
+    """(k,) int. Corners: vertices, and after these the piercings of edges."""
     chord: np.ndarray
+    """(k,) bool. Whether the part goes from this corner to the next one along the wall."""
 
     def take(self, rows: np.ndarray) -> TrimmedFaces:
         """Return some of the parts."""

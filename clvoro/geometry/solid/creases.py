@@ -17,28 +17,21 @@ _TURN = math.radians(50)  # a chain that turns by more than this at a vertex has
 
 @dataclass(frozen=True)
 class Creases:
-    """The edges between smooth patches.
-
-    Attributes
-    ----------
-    edges : (e, 2) int
-        Ends, as vertices of the surface. The edges of a chain follow each other, each from its first end to its second.
-    patches : (e, 2) int32
-        The patches to the left and to the right of each edge, seen from outside of the region with the edge upwards.
-    triangles : (e, 2) int
-        The triangles there.
-    angle : (e,) float
-        Interior dihedral angle in radians: below pi at convex edges, above pi at concave ones, pi at borders that are
-        drawn on a smooth surface.
-    chain : (e,) int
-        The chain of each edge, ascending. Chains end at corners, or are closed.
-    """
+    """The edges between smooth patches."""
 
     edges: np.ndarray
+    """(e, 2) int. Ends, as vertices of the surface. The edges of a chain follow each other, each from its first end to
+    its second."""
     patches: np.ndarray
+    """(e, 2) int32. The patches to the left and to the right of each edge, seen from outside of the region with the
+    edge upwards."""
     triangles: np.ndarray
+    """(e, 2) int. The triangles there."""
     angle: np.ndarray
+    """(e,) float. Interior dihedral angle in radians: below pi at convex edges, above pi at concave ones, pi at borders
+    that are drawn on a smooth surface."""
     chain: np.ndarray
+    """(e,) int. The chain of each edge, ascending. Chains end at corners, or are closed."""
 
     def __len__(self) -> int:
         return len(self.edges)

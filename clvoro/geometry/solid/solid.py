@@ -44,23 +44,17 @@ _MARGIN = 0.05  # of the longest edge, by which the clip box is larger than the 
 
 @dataclass(frozen=True)
 class Feet:
-    """The nearest points of a surface.
-
-    Attributes
-    ----------
-    triangle : (n,) int
-        -1 where nothing is near.
-    weights : (n, 3) float
-        Weights of the triangle's corners in the foot; 0 to round-off for the corner opposite to a side that it lies on.
-    point : (n, 3) float
-    distance : (n,) float
-        inf where nothing is near.
-    """
+    """The nearest points of a surface."""
 
     triangle: np.ndarray
+    """(n,) int. -1 where nothing is near."""
     weights: np.ndarray
+    """(n, 3) float. Weights of the triangle's corners in the foot; 0 to round-off for the corner opposite to a side
+    that it lies on."""
     point: np.ndarray
+    """(n, 3) float."""
     distance: np.ndarray
+    """(n,) float. inf where nothing is near."""
 
 
 class NearestTriangles:

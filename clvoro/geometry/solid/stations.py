@@ -53,37 +53,25 @@ _MOST_INNER = 500  # of the linear least squares in it
 
 @dataclass(frozen=True)
 class Stations(FixedGenerators):
-    """Generators around concave creases.
-
-    Attributes
-    ----------
-    size : (n,) float
-        The size h of their cells.
-    chain : (n,) int
-        The chain that each one belongs to; -1 for those that complete a corner.
-    """
+    """Generators around concave creases."""
 
     size: np.ndarray
+    """(n,) float. The size h of their cells."""
     chain: np.ndarray
+    """(n,) int. The chain that each one belongs to; -1 for those that complete a corner."""
 
 
 @dataclass(frozen=True)
 class Line:
-    """A chain of creases as a line: vertices and, at each of them, tangents and the normals of both patches.
-
-    Attributes
-    ----------
-    points, tangents, left, right : (m, 3) float
-    at : (m,) float
-        Length along the line.
-    closed : bool
-    """
+    """A chain of creases as a line: vertices and, at each of them, tangents and the normals of both patches."""
 
     points: np.ndarray
     tangents: np.ndarray
     left: np.ndarray
     right: np.ndarray
+    """`points`, `tangents`, `left`, `right`: (m, 3) float."""
     at: np.ndarray
+    """(m,) float. Length along the line."""
     closed: bool
 
     def along(self, values: np.ndarray, s: np.ndarray) -> np.ndarray:
