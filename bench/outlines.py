@@ -7,8 +7,9 @@ Masks are water along the edges of pixels of length 1, which touch at corners. T
 a smooth random field; "checkers", patches of a checkerboard; "shores", blobs that touch the shore, too, with single
 pixels along it; or "noise", each pixel with a probability of 1 : 4. Digitized outlines are rough shores of about 60
 pixels: "coasts" with needles, slits and spikes of a width from 1e-10 to 1e-2 and islands that touch in a point,
-"charts" with vertices twice or nearly so, rings that nearly touch, and edges that run there and back. All cells have
-the same size, in pixels.
+"charts" with vertices twice or nearly so, rings that nearly touch, and edges that run there and back; those that cross
+themselves are repaired. "rivers" are masks, too; "buildings" and "archipelagos" leave space between bodies that touch,
+"contours" are parts of a smooth field. All cells have the same size, in pixels.
 
 Rows have means over the outlines, of the domain as given or `simplified` by 1.5 sizes, and what becomes of the meshes:
 accepted by `checkMesh -allGeometry -allTopology` (without OpenFOAM by its criteria), refused by a message before the
@@ -126,7 +127,10 @@ def chart(rng: np.random.Generator) -> clvoro.Polygon:
             out = x[k] - x.mean(axis=0)
             x = np.insert(x, k + 1, [x[k] + 0.1 * out, x[k]], axis=0)
         rings.append(x)
-    return clvoro.Polygon(rings[0], rings[1:])
+    try:
+        return clvoro.Polygon(rings[0], rings[1:])
+    except clvoro.ClvoroError:
+        return clvoro.Polygon(rings[0], rings[1:], repair=True)
 
 
 def _rivers(rng: np.random.Generator) -> np.ndarray:
@@ -172,8 +176,8 @@ def archipelago(rng: np.random.Generator) -> clvoro.Polygon:
         r = 10 ** rng.uniform(-0.7, 0.5, 2)
         ring = rng.uniform(2, 30, 2) + r * np.column_stack([np.cos(turn), np.sin(turn)])
         islands.append(shapely.Polygon(np.round(ring, int(rng.integers(0, 3)))).buffer(0))
-    sea = shapely.remove_repeated_points(shapely.box(0, 0, 32, 32).difference(shapely.union_all(islands)), 1e-9)
-    return clvoro.Polygon.from_shapely(max(shapely.get_parts(sea), key=lambda part: part.area))
+    sea = shapely.box(0, 0, 32, 32).difference(shapely.union_all(islands))
+    return clvoro.Polygon.from_shapely(max(shapely.get_parts(sea), key=lambda part: part.area), repair=True)
 
 
 MASKS = {"blobs": _blobs, "checkers": _checkers, "shores": _shores, "noise": _noise, "rivers": _rivers}

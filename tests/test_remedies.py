@@ -492,17 +492,12 @@ ROWS = [
     ),
     (
         lambda t: clvoro.Polygon([SQUARE[k] for k in (0, 2, 1, 3)]),
-        lambda t: clvoro.Polygon.from_shapely(shapely.make_valid(shapely.Polygon([SQUARE[k] for k in (0, 2, 1, 3)]))),
+        lambda t: clvoro.Polygon([SQUARE[k] for k in (0, 2, 1, 3)], repair=True),
     ),
     (lambda t: clvoro.Polygon("lake.geojson"), lambda t: clvoro.Polygon.from_geojson(t.lake)),
     (lambda t: clvoro.Polygon(np.multiply(SQUARE, 1e200)), lambda t: clvoro.Polygon(SQUARE)),
     (lambda t: clvoro.Polygon(np.add(SQUARE, 1e16)), lambda t: clvoro.Polygon(SQUARE)),
-    (
-        lambda t: clvoro.Polygon([*SQUARE, (1e-15, 1)]),
-        lambda t: clvoro.Polygon.from_shapely(
-            shapely.remove_repeated_points(shapely.Polygon([*SQUARE, (1e-15, 1)]), 1e-9)
-        ),
-    ),
+    (lambda t: clvoro.Polygon([*SQUARE, (1e-15, 1)]), lambda t: clvoro.Polygon([*SQUARE, (1e-15, 1)], repair=True)),
     (lambda t: clvoro.Polygon(SQUARE, [HOLE, HOLE]), lambda t: clvoro.Polygon(SQUARE, [HOLE])),
     (
         lambda t: clvoro.Polygon(SQUARE, [HOLE], names={"hole-1": [0]}),

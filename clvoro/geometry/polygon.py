@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import shapely
 
-from ..arguments import check_rows, format_point
-from ..errors import InputError, InputTypeError
+from ..arguments import check_rows, format_point, warn
+from ..errors import InputError, InputTypeError, MismatchWarning
 from ..opencl.engine import Traits
 from .boundary_names import BoundaryNames, Walls
 from .curved_edges import CurvedEdges
@@ -25,7 +25,7 @@ from .edge_bins import EdgeBins
 from .fixed_generators import FixedGenerators, place_around_corners
 from .gaps import NarrowPart, find_narrow_parts
 from .geojson import may_be_degrees, pieces_of_description, pieces_of_geojson, pieces_of_shape, pieces_of_wkt, squeezed
-from .rings import OrientedRings, make_rings, project, signed_area
+from .rings import REPAIRED, OrientedRings, make_rings, project, repaired, signed_area
 from .shapes import Edges
 from .simplification import pieces_of, simplify
 
@@ -58,6 +58,11 @@ class Polygon(Domain):
         Names of boundaries, each with its edges: numbers, default names, or a sequence of them. By default a boundary
         is a ring: ``outer``, ``hole-1``, ``hole-2``, ..., or ``outer-1``, ``outer-2``, ... with several pieces, or a
         curve with a name. Edges that are not mentioned keep the name of their curve or ring.
+    repair : bool
+        Take rings that cross themselves or each other, holes that overlap, and vertices twice or nearly so: what holes
+        share counts once, loops become rings of their own, and a domain that is cut in two has several pieces. A
+        warning says by how much the area changes. Edges get the name of the nearest given edge; `names` has numbers
+        then. Curves become polylines.
 
     Attributes
     ----------
@@ -102,15 +107,23 @@ class Polygon(Domain):
     ('outer', 'edge')
     """
 
-    def __init__(self, outer: object, holes: Sequence[object] = (), names: Mapping[str, Walls] | None = None):
+    def __init__(
+        self,
+        outer: object,
+        holes: Sequence[object] = (),
+        names: Mapping[str, Walls] | None = None,
+        repair: bool = False,
+    ):
         try:
             rings = [outer, *holes]
         except TypeError:
             raise InputTypeError(f"holes is a {type(holes).__name__}, expected a list of rings") from None
-        self._build([rings], names)
+        self._build([rings], names, repair=repair)
 
     @classmethod
-    def from_pieces(cls, pieces: Sequence[Sequence[object]], names: Mapping[str, Walls] | None = None) -> Polygon:
+    def from_pieces(
+        cls, pieces: Sequence[Sequence[object]], names: Mapping[str, Walls] | None = None, repair: bool = False
+    ) -> Polygon:
         """Make a domain of several pieces, each a list of its outer ring and its holes.
 
         Edges are numbered through the rings of the first piece, then of the second one, and so on.
@@ -121,19 +134,19 @@ class Polygon(Domain):
         2
         """
         made = cls.__new__(cls)
-        made._build(pieces, names)
+        made._build(pieces, names, repair=repair)
         return made
 
     @classmethod
-    def from_shapely(cls, geometry: Any, names: Mapping[str, Walls] | None = None) -> Polygon:
+    def from_shapely(cls, geometry: Any, names: Mapping[str, Walls] | None = None, repair: bool = False) -> Polygon:
         """Make a domain of a shapely Polygon or MultiPolygon; z coordinates are dropped.
 
         Of a GeometryCollection, as `shapely.make_valid` returns it, the polygons count.
         """
-        return cls.from_pieces(pieces_of_shape(geometry), names)
+        return cls.from_pieces(pieces_of_shape(geometry), names, repair)
 
     @classmethod
-    def from_wkt(cls, text: str, names: Mapping[str, Walls] | None = None) -> Polygon:
+    def from_wkt(cls, text: str, names: Mapping[str, Walls] | None = None, repair: bool = False) -> Polygon:
         """Make a domain of a POLYGON or MULTIPOLYGON in well-known text.
 
         Examples
@@ -141,11 +154,14 @@ class Polygon(Domain):
         >>> clvoro.Polygon.from_wkt("POLYGON ((0 0, 2 0, 2 1, 0 1, 0 0))").measure
         2.0
         """
-        return cls.from_pieces(pieces_of_wkt(text), names)
+        return cls.from_pieces(pieces_of_wkt(text), names, repair)
 
     @classmethod
     def from_geojson(
-        cls, source: str | PathLike[str] | Mapping[str, Any], names: Mapping[str, Walls] | None = None
+        cls,
+        source: str | PathLike[str] | Mapping[str, Any],
+        names: Mapping[str, Walls] | None = None,
+        repair: bool = False,
     ) -> Polygon:
         """Make a domain of the polygons in GeoJSON.
 
@@ -158,6 +174,8 @@ class Polygon(Domain):
             ``"boundaries": {"island": [4, 5, 6]}``.
         names : mapping, optional
             Names of boundaries, in place of those in `source`.
+        repair : bool
+            See `Polygon`.
 
         Raises
         ------
@@ -173,7 +191,7 @@ class Polygon(Domain):
         """
         pieces, own_names = pieces_of_geojson(source)
         try:
-            made = cls.from_pieces(pieces, own_names if names is None else names)
+            made = cls.from_pieces(pieces, own_names if names is None else names, repair)
             made.projected = True
             return made
         except InputError as error:
@@ -182,8 +200,18 @@ class Polygon(Domain):
             raise InputError(f"{source}: {error}") from error
 
     def _build(
-        self, pieces: Sequence[Sequence[object]], names: Mapping[str, Walls] | None, curves: object = None
+        self,
+        pieces: Sequence[Sequence[object]],
+        names: Mapping[str, Walls] | None,
+        curves: object = None,
+        repair: bool = False,
     ) -> None:
+        if repair:
+            pieces, names, change = repaired(pieces, names)
+            if change > REPAIRED:
+                warn(
+                    f"the rings of the domain were repaired: its area changes by {100 * change:.2g} %", MismatchWarning
+                )
         made = make_rings(pieces)
         rings = [ring for piece in made for ring in piece]
         self.vertices = np.concatenate([ring.given for ring in rings])

@@ -24,6 +24,8 @@ from .domain import LARGEST_EDGE
 
 SHORTEST_EDGE = 1e-12
 """Shortest edge, as a share of the bounding box's longest edge."""
+REPAIRED = 1e-10
+"""Shortest edge of repaired rings over the extent of the domain, and their least area over its square."""
 _RESOLUTION = 2.0**-40
 """Smallest extent, as a share of the largest coordinate: 12 bits are left of float64's 52."""
 WALL_CORNER = np.pi / 6
@@ -186,6 +188,62 @@ def make_rings(pieces: Sequence[Sequence[object]]) -> list[list[Ring]]:
     return [[_oriented(ring, clockwise=i > 0) for i, ring in enumerate(piece)] for piece in rings]
 
 
+def repaired(
+    pieces: Sequence[Sequence[object]], names: Mapping[str, Any] | None
+) -> tuple[list[list[np.ndarray]], dict[str, list[int]] | None, float]:
+    """Return pieces whose rings do not cross, as `make_rings` takes them, of any rings; see `Polygon`.
+
+    Returns
+    -------
+    pieces : list of lists of (k, 2) float64
+    names : dict or None
+        Edges of the new rings for each of `names`: those nearest to an edge with the name.
+    change : float
+        Area that is added or dropped, over that of the sum of the outer rings without their holes.
+    """
+    flat = [_cleaned(ring, f"ring {k}") for k, ring in enumerate(ring for piece in pieces for ring in piece)]
+    rings, shapes, before = iter(flat), [], 0.0
+    for piece in pieces:
+        outer, *holes = (shapely.Polygon(next(rings).vertices) for _ in piece)
+        before += outer.area - sum(hole.area for hole in holes)
+        shapes.append(_valid(outer).difference(shapely.union_all([_valid(hole) for hole in holes])))
+    whole = shapely.union_all(shapes)
+    extent = float(np.ptp(np.concatenate([ring.vertices for ring in flat]), axis=0).max())
+    whole = _valid(shapely.remove_repeated_points(whole, REPAIRED * extent))
+    least = REPAIRED * extent**2
+    parts = [part for part in shapely.get_parts(whole) if part.area > least]
+    if not parts:
+        raise InputError("Polygon has no area that is left when its rings are repaired, expected one with an area")
+    made = [
+        [shapely.get_coordinates(part.exterior)[:-1]]
+        + [shapely.get_coordinates(hole)[:-1] for hole in part.interiors if shapely.Polygon(hole).area > least]
+        for part in parts
+    ]
+    change = abs(sum(part.area for part in parts) - before) / max(before, least)
+    if names is None:
+        return made, None, change
+    given = np.concatenate([ring.given for ring in flat])
+    after = np.concatenate([np.roll(ring.given, -1, axis=0) for ring in flat])
+    middles = [(ring + np.roll(ring, -1, axis=0)) / 2 for piece in made for ring in piece]
+    tree = shapely.STRtree(np.asarray(shapely.linestrings(np.stack([given, after], axis=1))))
+    nearest = tree.nearest(shapely.points(np.concatenate(middles)))
+    found: dict[str, list[int]] = {}
+    for name, edges in names.items():
+        rows = np.atleast_1d(np.asarray(edges))
+        if rows.dtype.kind not in "iu" or (rows.size and not 0 <= rows.min() <= rows.max() < len(given)):
+            raise InputError(
+                f"names[{name!r}] is {edges!r:.60}, expected numbers of edges from 0 to {len(given) - 1} where rings "
+                "are repaired"
+            )
+        found[name] = np.flatnonzero(np.isin(nearest, rows)).tolist()
+    return made, {name: edges for name, edges in found.items() if edges} or None, change
+
+
+def _valid(shape: Any) -> Any:
+    """Return a shape whose rings do not cross, without lines and points."""
+    return shape if shape.is_valid else shapely.make_valid(shape, method="structure", keep_collapsed=False)
+
+
 def signed_area(vertices: np.ndarray) -> float:
     """Return the area inside a ring (k, 2), positive if it runs counter-clockwise; correctly rounded."""
     x, y = vertices.T
@@ -293,7 +351,7 @@ def _check_lengths(rings: Sequence[Ring]) -> None:
                 f"Polygon's {ring.name} has an edge of length {length[e]:.3g} at vertex {ring.numbers[e]}"
                 f"{ring.curved.label(ring.numbers[e])}, {format_point(ring.vertices[e])}, expected at least "
                 f"{SHORTEST_EDGE:g} of the domain's size; "
-                "merge its ends (shapely.remove_repeated_points(geometry, tolerance) does)"
+                "merge its ends, as Polygon(..., repair=True) does"
             )
 
 
@@ -314,7 +372,7 @@ def _shape(piece: Sequence[Ring]) -> Any:
     return shapely.Polygon(piece[0].vertices, [hole.vertices for hole in piece[1:]])
 
 
-_UNITE = "unite the pieces (shapely.union_all)"
+_UNITE = "unite the pieces, as Polygon.from_pieces(pieces, repair=True) does"
 _REMEDIES = {
     "Hole lies outside shell": "leave the hole out, or make it a separate piece",
     "Holes are nested": "unite the holes, or make the inner one a separate piece",
@@ -344,9 +402,7 @@ def _check_valid(shape: Any, rings: Sequence[Ring]) -> None:
     ]
     more = len(there) - _NAMED
     where = " and ".join([*there[:_NAMED], *([f"edges of {more} more rings"] if more > 0 else [])])
-    remedy = "correct it, as Polygon.from_shapely(shapely.make_valid(shapely.Polygon(ring))) does"
-    if len(there) > 1:
-        remedy = "move one of the rings, or unite or cut them in shapely and use Polygon.from_shapely"
+    remedy = "correct it, as Polygon(..., repair=True) does, also in Polygon.from_shapely and the like"
     if shape.geom_type == "MultiPolygon":  # each piece is valid
         remedy = _UNITE
     remedy = _REMEDIES.get(reason, remedy)

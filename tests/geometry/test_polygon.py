@@ -9,7 +9,7 @@ import pytest
 import shapely
 
 import clvoro
-from clvoro.errors import InputError, InputTypeError
+from clvoro.errors import InputError, InputTypeError, MismatchWarning
 from tests.reference.polygons import HOLE, OTHER, SQUARE, crossings, distances, ragged
 
 
@@ -284,3 +284,40 @@ def test_checkpoints_tell_domains_apart() -> None:
     assert len(set(described)) == 3
     again = run_fingerprint(clvoro.Polygon(SQUARE.copy()), options, np.dtype(float), None)
     assert json.dumps(again) == described[0]
+
+
+@pytest.mark.parametrize("how", ["rings", "shapely", "wkt", "geojson"])
+def test_repaired_rings_cover_what_shapely_says(how):
+    """The shore crosses itself, two islands overlap, and a vertex is there nearly twice."""
+    shore = [(0, 0), (6, 0), (6, 4), (6 + 1e-14, 4), (5, 4), (4, 5), (5, 5), (4, 4), (0, 4)]
+    islands = [[(1, 1), (2, 1), (2, 2), (1, 2)], [(1.5, 1.5), (3, 1.5), (3, 3), (1.5, 3)]]
+    make, given = {
+        "rings": (clvoro.Polygon, (shore, islands)),
+        "shapely": (clvoro.Polygon.from_shapely, (shapely.Polygon(shore, islands),)),
+        "wkt": (clvoro.Polygon.from_wkt, (shapely.Polygon(shore, islands).wkt,)),
+        "geojson": (clvoro.Polygon.from_geojson, (shapely.geometry.mapping(shapely.Polygon(shore, islands)),)),
+    }[how]
+    with pytest.raises(InputError):
+        make(*given)
+    names = {"island": range(9, 17), "right": [1]}
+    with pytest.warns(MismatchWarning, match="its area changes by"):
+        made = make(*given, names=names, repair=True)
+    land = shapely.union_all([shapely.Polygon(island) for island in islands])
+    sea = shapely.make_valid(shapely.Polygon(shore)).difference(land)
+    assert made.measure == pytest.approx(sea.area, rel=1e-12)
+    assert made.n_pieces == 2
+    assert set(made.boundary_names) >= {"island", "right"}
+    edges = made.boundary("right")
+    assert np.allclose(sorted([*edges.begin[:, 1], *edges.end[:, 1]]), [0, 4])
+    island = made.boundary("island")
+    assert np.hypot(*(island.end - island.begin).T).sum() == pytest.approx(land.length)
+
+
+def test_repair_changes_nothing_in_a_valid_domain(recwarn):
+    ring, hole = [(0, 0), (3, 0), (3, 3), (0, 3)], [(1, 1), (2, 1), (2, 2)]
+    assert clvoro.Polygon(ring, [hole], repair=True).measure == clvoro.Polygon(ring, [hole]).measure
+    assert not recwarn
+    with pytest.raises(InputError, match="expected numbers of edges from 0 to 6"):
+        clvoro.Polygon(ring, [hole], names={"all": "outer"}, repair=True)
+    with pytest.raises(InputError, match="no area that is left"):
+        clvoro.Polygon(hole, [ring], repair=True)
