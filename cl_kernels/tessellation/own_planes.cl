@@ -5,7 +5,10 @@
    For each patch, its nearest point to the generator x is the foot. The plane has the normal of the patch there, which
    is interpolated between corners of triangles, and passes through the foot, moved inwards by `shift`. A foot on a
    convex crease has a plane, so that patches are continued there; one on a concave crease has none. A patch whose plane
-   does not have x inside, or whose foot cannot be seen from x, is hidden behind others. */
+   does not have x inside, or whose foot cannot be seen from x, is hidden behind others.
+
+   Where a patch is bent around x, as in the tip of a cone or in a rod, it has further planes, in AROUND directions from
+   x about its mean normal there. */
 #ifndef MOST_OWN
 #error "build with -DMOST_OWN=patches that may be near a generator"
 #endif
@@ -13,6 +16,14 @@
 #define LEAST_DEPTH (16 * REAL_EPS)
 /* Share of the way to a foot that must be free. */
 #define FREE_SHARE R(0.999)
+
+/* A patch may be bent around a generator if `shift` is more than this share of the depth. It is if it is opposite, too,
+   within OPPOSITE of the reach. Planes are moved inwards by AREA_SHARE of their depth then, so that they enclose the
+   area of a circle. */
+#define BENT R(0.1)
+#define OPPOSITE R(0.75)
+#define AREA_SHARE R(0.1)
+#define AROUND 5
 
 /* Whether the way from x to x + way is free of triangles, up to its end. */
 inline bool is_free(REAL4 x, REAL4 way, WALL_ARGS)
@@ -22,6 +33,55 @@ inline bool is_free(REAL4 x, REAL4 way, WALL_ARGS)
         if (crossing_of(t, x, most, wall_corners) <= 1)
             return false;
     return true;
+}
+
+/* The blend of the normals at point (s, t) of triangle n, with the shift; sets `at` to the way there from x. */
+inline REAL4 blend_at(int n, REAL s, REAL t, REAL4 x, REAL4 *at, global const REAL4 *wall_corners,
+                      global const REAL4 *wall_normals)
+{
+    const REAL r = 1 - s - t;
+    *at = r * (wall_corners[3 * n] - x) + s * (wall_corners[3 * n + 1] - x) + t * (wall_corners[3 * n + 2] - x);
+    return r * wall_normals[3 * n] + s * wall_normals[3 * n + 1] + t * wall_normals[3 * n + 2];
+}
+
+/* The unit vector along a blend of normals. */
+inline REAL4 direction_of(REAL4 blend)
+{
+    const REAL4 normal = (REAL4)(blend.s0, blend.s1, blend.s2, 0);
+    return normal / sqrt(dot(normal, normal));
+}
+
+/* Whether the way from x ends on `patch`; then `plane` is its tangent plane there. */
+inline bool meets_patch(REAL4 x, REAL4 way, int patch, REAL4 *plane, WALL_ARGS, global const REAL4 *wall_normals)
+{
+    REAL first = 2;
+    int hit = -1;
+    EACH_TRIANGLE (t, fmin(x, x + way), fmax(x, x + way)) {
+        const REAL gone = crossing_of(t, x, way, wall_corners);
+        if (gone < first || (gone == first && gone < 2 && t < hit)) {
+            first = gone;
+            hit = t;
+        }
+    }
+    if (hit < 0 || wall_kinds[hit].s0 != patch)
+        return false;
+    const REAL4 there = x + first * way;
+    const foot_t foot = foot_on_triangle(wall_corners[3 * hit] - there, wall_corners[3 * hit + 1] - there,
+                                         wall_corners[3 * hit + 2] - there, wall_kinds[hit].s1);
+    REAL4 at;
+    *plane = direction_of(blend_at(hit, foot.s, foot.t, x, &at, wall_corners, wall_normals));
+    plane->s3 = dot(*plane, at);
+    return plane->s3 > 0;
+}
+
+/* Direction k from a generator with a wall in the direction of `normal`: first away from it. */
+inline REAL4 direction_around(int k, REAL4 normal)
+{
+    const REAL4 other = fabs(normal.s0) < R(0.6) ? (REAL4)(1, 0, 0, 0) : (REAL4)(0, 1, 0, 0);
+    const REAL4 across = cross_of_walls(normal, other), side = across / sqrt(dot(across, across));
+    if (k == 0)
+        return -normal;
+    return (k & 1 ? 1 : -1) * (k < 3 ? side : cross_of_walls(normal, side));
 }
 
 /* Reach of the first search: `factor` times the spacing of generators about item p. */
@@ -73,22 +133,29 @@ kernel void find_own_planes(const int size, global const REAL *points, WALL_ARGS
         const foot_t foot = feet[order[m]].at;
         if (foot.kind == CONCAVE_CREASE)
             continue;
-        const REAL r = 1 - foot.s - foot.t;
-        const REAL4 at = r * (wall_corners[3 * t] - x) + foot.s * (wall_corners[3 * t + 1] - x) +
-                         foot.t * (wall_corners[3 * t + 2] - x);
-        const REAL4 blend =
-            r * wall_normals[3 * t] + foot.s * wall_normals[3 * t + 1] + foot.t * wall_normals[3 * t + 2];
-        REAL4 normal = (REAL4)(blend.s0, blend.s1, blend.s2, 0);
-        normal /= sqrt(dot(normal, normal));
+        const int patch = feet[order[m]].patch;
+        REAL4 at;
+        const REAL4 blend = blend_at(t, foot.s, foot.t, x, &at, wall_corners, wall_normals);
+        REAL4 normal = direction_of(blend), plane;
         const REAL depth = dot(normal, at);
         if (m > 0 && (!(depth > 0) || !is_free(x, at, WALL)))
             continue;
         if (!(depth > -LEAST_DEPTH))
             atomic_inc(counters + 2);
-        normal.s3 = fmax(fmax(depth - blend.s3, depth / 2), LEAST_DEPTH);
+        const bool bent = blend.s3 > BENT * depth && meets_patch(x, OPPOSITE * reach * direction_around(0, normal),
+                                                                 patch, &plane, WALL, wall_normals);
+        const REAL4 direction = normal;
+        normal.s3 = fmax(bent ? (1 - AREA_SHARE) * depth : fmax(depth - blend.s3, depth / 2), LEAST_DEPTH);
         planes[count] = normal;
-        labels[count] = -1 - feet[order[m]].patch;
+        labels[count] = -1 - patch;
         ++count;
+        for (int k = 0; bent && k < AROUND; ++k)
+            if (count + n - m <= MOST_OWN &&
+                meets_patch(x, reach * direction_around(k, direction), patch, &plane, WALL, wall_normals)) {
+                plane.s3 = fmax((1 - AREA_SHARE) * plane.s3, LEAST_DEPTH);
+                planes[count] = plane;
+                labels[count++] = -1 - patch;
+            }
     }
     const int place = atomic_add(counters, count);
     if (place + count > room) {

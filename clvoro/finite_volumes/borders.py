@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -74,21 +75,23 @@ def on_surfaces(
     remake : callable
         Returns the diagram of other generators (n, 3).
     """
-    domain = diagram.domain
+    domain, first = diagram.domain, _made(diagram, sheets)
 
     def depth(x: np.ndarray) -> np.ndarray:
         return np.where(domain.contains(x), domain.boundary_distance(x), -1.0)
 
-    def again(best: _OnSurfaces, rows: np.ndarray, move: int) -> _OnSurfaces | None:
-        mesh, x = best.diagram, points.copy()
-        own = slice(None) if mesh.home is None else mesh.home >= 0
-        x[best.home[own]] = mesh.points[own]
+    def again(points: np.ndarray, rows: np.ndarray, best: _OnSurfaces, move: int) -> _OnSurfaces | None:
+        del rows, best, move
         try:
-            return _made(remake(moved(domain, depth, x, sizes, rows, move)), sheets)
+            return _made(remake(points), sheets)
         except InputError:
             return None
 
-    return fewest_rejected(_made(diagram, sheets), lambda a: a.home[a.rejected], again, len(points)).diagram
+    points, own = points.copy(), slice(None) if diagram.home is None else diagram.home >= 0
+    points[first.home[own]] = diagram.points[own]
+    return fewest_rejected(
+        first, points, sizes, lambda a: a.home[a.rejected], partial(moved, domain, depth, sizes), again
+    ).diagram
 
 
 def _made(diagram: Diagram, sheets: Sheets) -> _OnSurfaces:

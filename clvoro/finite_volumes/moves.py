@@ -11,6 +11,7 @@ import scipy
 from ..geometry.domain import Domain
 from ..geometry.solid.creases import connect
 from ..geometry.surfaces.sheets import Sheets
+from ..mesh.connectivity import distinct
 
 T = TypeVar("T")
 FEW = 0.03
@@ -19,6 +20,8 @@ _MOVES = 4
 """How often generators of rejected cells are moved, at most."""
 _MOVE, _BESIDE = 0.15, 1.3
 """How far they are moved, over h. Generators nearer to them than the second number, over h, are moved as well."""
+_GROUP = 4.0
+"""Rejected cells nearer to each other than this, over h, are one group."""
 _DEEP = 0.1
 """Least depth of moved generators in the domain, over h."""
 _NEAR, _MIRRORED = 0.75, 0.2
@@ -31,36 +34,67 @@ _FREE = 0.9
 
 
 def fewest_rejected(
-    first: T, rejected: Callable[[T], np.ndarray], again: Callable[[T, np.ndarray, int], T | None], n: int
+    first: T,
+    points: np.ndarray,
+    sizes: np.ndarray,
+    rejected: Callable[[T], np.ndarray],
+    shift: Callable[[np.ndarray, np.ndarray, int], np.ndarray],
+    remake: Callable[[np.ndarray, np.ndarray, T, int], T | None],
 ) -> T:
     """Return the mesh of the fewest rejected cells: the `first`, or one of those made again.
+
+    Rejected cells near each other are a group. Its moved generators stay there if it has fewer rejected cells
+    afterwards; others move back.
 
     Parameters
     ----------
     first : object
-        The mesh of `n` generators.
+        The mesh of generators `points` (n, 3), for cells of the `sizes` (n,).
     rejected : callable
         Returns the generators of the rejected cells of a mesh, (k,) int; -1 for none.
-    again : callable
-        Makes the mesh again; called with the best mesh, the generators of its rejected cells, each once, and the number
-        of the attempt. None ends the attempts.
+    shift : callable
+        Returns all generators; those of some rows (k,) int, and those beside them, are moved. See `moved`.
+    remake : callable
+        Makes the mesh of other generators (n, 3); called with these, the rows, the best mesh, and the number of the
+        attempt. None ends the attempts.
     """
-    best = first
+    best, bad = first, rejected(first)
     for move in range(_MOVES):
-        bad = rejected(best)
-        rows = np.setdiff1d(bad, [-1])
-        if not 0 < len(rows) <= FEW * n or (made := again(best, rows, move)) is None:
+        bad = bad[bad >= 0]
+        rows = distinct(bad)
+        if not 0 < len(rows) <= FEW * len(points):
             break
-        if len(rejected(made)) < len(bad):
+        trial = shift(points, rows, move)
+        if (made := remake(trial, rows, best, move)) is None:
+            break
+        new = rejected(made)
+        if len(new) < len(rejected(best)):
             best = made
+        new = new[new >= 0]
+        count, group = _groups(points, sizes, np.concatenate([bad, new]))
+        before, after = np.split(group, [len(bad)])
+        fewer = np.bincount(after, minlength=count) < np.bincount(before, minlength=count)
+        changed = np.flatnonzero((trial != points).any(axis=1))
+        changed = changed[fewer[before[scipy.spatial.KDTree(points[bad]).query(points[changed])[1]]]]
+        points = points.copy()
+        points[changed] = trial[changed]
+        bad = np.concatenate([bad[~fewer[before]], new[fewer[after] | ~np.isin(after, before)]])
     return best
+
+
+def _groups(points: np.ndarray, sizes: np.ndarray, rows: np.ndarray) -> tuple[int, np.ndarray]:
+    """Return the number of groups of near generators, and the group of each of `rows` (k,) int."""
+    x, h = points[rows], _GROUP * sizes[rows]
+    pairs = scipy.spatial.KDTree(x).query_pairs(float(h.max()), output_type="ndarray")
+    apart = np.linalg.norm(x[pairs[:, 0]] - x[pairs[:, 1]], axis=1)
+    return connect(len(rows), pairs[apart < h[pairs].min(axis=1)])
 
 
 def moved(
     domain: Domain,
     depth: Callable[[np.ndarray], np.ndarray],
-    points: np.ndarray,
     sizes: np.ndarray,
+    points: np.ndarray,
     rows: np.ndarray,
     move: int,
 ) -> np.ndarray:

@@ -11,7 +11,7 @@ CUBE = clvoro.Solid.box((0, 0, 0), (1, 1, 1))
 
 
 def in_solid(solid, x, rows, move):
-    return moved(solid, lambda at: -solid.signed_distance(at), x, np.full(len(x), H), np.array(rows), move)
+    return moved(solid, lambda at: -solid.signed_distance(at), np.full(len(x), H), x, np.array(rows), move)
 
 
 def test_generators_of_rejected_cells_are_moved_inside_of_the_solid():
@@ -39,7 +39,7 @@ def test_pairs_stay_mirror_images_in_all_patches_between_them():
     x = np.array([*cross, *pair, (0.2, 0.5 + 1.1 * H, 0.5)])
     depth = domain.boundary_distance
     for move in range(4):
-        away = moved(domain, depth, x, np.full(len(x), H), np.array([0, 4]), move) - x
+        away = moved(domain, depth, np.full(len(x), H), x, np.array([0, 4]), move) - x
         assert away[:4] == pytest.approx(np.tile(away[0] * (0, 0, 1), (4, 1)), abs=1e-12)
         assert away[4:6] == pytest.approx(np.tile(away[4] * (1, 0, 1), (2, 1)), abs=1e-12)
         assert abs(away[0, 2]) > 0
@@ -48,14 +48,23 @@ def test_pairs_stay_mirror_images_in_all_patches_between_them():
 
 
 def test_the_mesh_of_the_fewest_rejected_cells_is_kept():
-    """Each attempt begins at the best mesh so far; too many rejected cells end the attempts, as does None."""
-    begun = []
+    """Generators of a group stay moved if it has fewer rejected cells; others move back. None ends the attempts."""
+    points = np.column_stack([np.arange(300) * 3.0, np.zeros((300, 2))])
+    meshes, begun = [[0, 1, 200, -1], [0, 200], [0, 0, 0], None], []
 
-    def again(best, rows, move):
-        begun.append((best, rows.tolist(), move))
-        return [[1, 2, 5], [3], [4, -1], None][move]
+    def shift(x, rows, move):
+        begun.append((np.flatnonzero(x[:, 1]).tolist(), rows.tolist(), move))
+        return x + np.isin(np.arange(300), rows)[:, None] * (0, 1, 0)
 
-    assert fewest_rejected([1, 2, 2], np.array, again, 1000) == [3]
-    assert begun == [([1, 2, 2], [1, 2], 0), ([1, 2, 2], [1, 2], 1), ([3], [3], 2), ([3], [3], 3)]
-    assert fewest_rejected([1, 2, 2], np.array, again, 10) == [1, 2, 2]
-    assert fewest_rejected([], np.array, again, 1000) == []
+    def kept(first):
+        return fewest_rejected(first, points, np.ones(300), np.array, shift, lambda x, rows, best, k: meshes[k])
+
+    assert kept([0, 1, 1, 100, 200]) == [0, 200]
+    assert begun == [
+        ([], [0, 1, 100, 200], 0),
+        ([0, 1, 100], [0, 1, 200], 1),
+        ([0, 1, 100], [0, 200], 2),
+        ([0, 1, 100, 200], [0], 3),
+    ]
+    assert kept([*range(10)]) == [*range(10)]
+    assert kept([]) == []

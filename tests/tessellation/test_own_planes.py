@@ -176,3 +176,23 @@ def test_nothing_leaks_through_a_thin_plate(ctx, real):
     assert (np.abs(side) > 0).sum() > 100
     assert not any(side[i] * side[j] < 0 for i, row in enumerate(rows) for j in row if j >= 0)
     assert t.volumes.get().sum(dtype=float) * solid.frame[1] ** 3 == pytest.approx(solid.measure, rel=0.02)
+
+
+def test_walls_bent_around_a_generator_cut_its_cell_on_all_sides(ctx):
+    """In a rod as thin as a cell, and in the tip of a cone, planes are a tenth of the depth inside of the walls."""
+    rod, cone = clvoro.Solid.cylinder((0, 0, 0), (0, 0, 2), 0.2), clvoro.Solid.cone((0, 0, 0), (0, 0, 2), 1)
+    for solid, x, slope in ((rod, (0.01, 0.02, 1.0), 0.0), (cone, (0.01, 0.02, 1.6), 0.5)):
+        device = Device(ctx, solid, np.dtype(np.float64), np.array([x]))
+        box = SolidBox(device.engine, solid, solid.wall_triangles, lambda y: np.full(len(y), 0.25))
+        box.guess(device.sort(), 1)
+        box._reach.fill(0.6 / solid.frame[1])
+        box.find(device.points)
+        first, count = box._rows.get()[0]
+        planes = box._planes.get()[first : first + count]
+        planes = planes[np.abs(planes[:, 2] - slope / np.hypot(1, slope)) < 0.02]  # not one at the tip itself
+        assert len(planes) >= 4
+        assert -1 < planes[:, :2].min(axis=0).max() < 0 < planes[:, :2].max(axis=0).min() < 1
+        axis = np.array([0, 0, 2]) if slope else np.array([0, 0, x[2]])
+        radius = 0.0 if slope else 0.2
+        depth = planes[:, :3] @ (axis - x) + radius * np.linalg.norm(planes[:, :2], axis=1)
+        assert planes[:, 3] * solid.frame[1] == pytest.approx(0.9 * depth, abs=0.01)

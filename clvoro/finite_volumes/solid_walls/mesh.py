@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 
 import numpy as np
 import scipy
@@ -180,11 +180,10 @@ def solid_diagram(
     near = NearWalls.of(surface, points, sizes, whole(points))
     last = _Attempts(surface, near, np.full(len(near.sizes), EXACT, np.int8), None, tell)
 
-    def again(best: _Attempts, rows: np.ndarray, move: int) -> _Attempts | None:
+    def again(points: np.ndarray, rows: np.ndarray, best: _Attempts, move: int) -> _Attempts | None:
         nonlocal last
         if last.are_spent:
             return None
-        points = moved(surface.solid, lambda x: -surface.closest(x)[2], best.near.points, sizes, rows, move)
         near = NearWalls.of(surface, points, sizes, whole(points))
         walls = np.full(len(points) + 1, EXACT, np.int8)
         walls[best.near.numbers] = best.walls
@@ -195,7 +194,14 @@ def solid_diagram(
             return None
         return last
 
-    best = fewest_rejected(last, lambda a: a.near.numbers[a.made.home[a.made.rejected]], again, len(points))
+    best = fewest_rejected(
+        last,
+        points,
+        sizes,
+        lambda a: a.near.numbers[a.made.home[a.made.rejected]],
+        partial(moved, surface.solid, lambda x: -surface.closest(x)[2], sizes),
+        again,
+    )
     near = best.near
     mesh, points = best.made, near.points
     rejected = mesh.faces.generators[mesh.rejected]

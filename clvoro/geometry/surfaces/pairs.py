@@ -29,7 +29,7 @@ from .sheets import Sheets
 _ON_WALL = 1e-7  # of the domain: points so near to its walls lie on them
 _PARTS = 64  # parts of the domain's extent into which edges are divided to find where they leave it
 _REACH = math.sqrt(0.5)  # distance of generators around a chord, over h
-_APART = math.radians(45), math.radians(35)  # least angle between two of them in one sector, and where that is too much
+_APART, _CLOSER = math.radians(45), math.radians(35)  # least angle between two of them in one sector; without room
 _HEIGHT, _LONGEST_REACH = 0.38, 1.3  # of h: their least distance from patches there, and their largest from the chord
 _FROM_WALL = 0.25  # of h: distance from a wall at which the angle between it and an edge is measured
 _DEPTH_AT_WALL, _LONGEST_AT_WALL = 0.4, 2.5  # least distance of generators there from the wall, longest chord, over h
@@ -134,10 +134,9 @@ def _angles_of_generators(sheets: np.ndarray) -> tuple[np.ndarray, float]:
     """
     sheets = np.sort(sheets % (2 * math.pi))
     least = math.asin(_HEIGHT / _LONGEST_REACH)
-    for separation in _APART:
-        beside = choose_angles(sheets.tolist(), [], separation, least)
-        if beside.min() > least - 1e-6:
-            break
+    beside = choose_angles(sheets.tolist(), [], _APART, least)
+    if beside.min() < least - 1e-6:
+        beside = choose_angles(sheets.tolist(), [], _CLOSER, least)
     reach = min(max(_REACH, _HEIGHT / math.sin(beside.min())), _LONGEST_REACH)
     apart = 2 * math.asin(0.5 / reach)
     found = []
