@@ -199,7 +199,7 @@ def repaired(
     names : dict or None
         Edges of the new rings for each of `names`: those nearest to an edge with the name.
     change : float
-        Area that is added or dropped, over that of the sum of the outer rings without their holes.
+        By how much the area differs from the sum of the outer rings without their holes, over the new area.
     """
     flat = [_cleaned(ring, f"ring {k}") for k, ring in enumerate(ring for piece in pieces for ring in piece)]
     rings, shapes, before = iter(flat), [], 0.0
@@ -219,7 +219,8 @@ def repaired(
         + [shapely.get_coordinates(hole)[:-1] for hole in part.interiors if shapely.Polygon(hole).area > least]
         for part in parts
     ]
-    change = abs(sum(part.area for part in parts) - before) / max(before, least)
+    area = sum(part.area for part in parts)
+    change = abs(area - before) / area
     if names is None:
         return made, None, change
     given = np.concatenate([ring.given for ring in flat])
