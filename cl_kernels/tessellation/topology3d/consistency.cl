@@ -16,7 +16,8 @@
    labels (c,)                   of each corner: its vertex, named by its first corner
    best_corners (c,)             of each vertex: the corner that its faces determine best; its position is the vertex's
    loop_starts (h + 1,), loops   of each half-face: its corners, counter-clockwise from outside
-   twins (h,)                    the half-face on the other side; itself at a wall, -1 where the graph has no face
+   twins (h,)                    the half-face on the other side; itself at a wall and towards a ghost, which has no cell;
+                                 -1 where the graph has no face
    reduced, reduced_counts       of each half-face: its loop as vertices, without repetitions and spurs; from
                                  loop_starts on
    differs (h,)                  1 where a half-face and its twin do not agree */
@@ -75,7 +76,7 @@ kernel void find_twins(const int size, global const int *starts, global const in
     for (int h = begin; h < end; ++h) {
         const int j = half_face_labels[h];
         int twin = h - begin < listed ? h : -1;
-        if (j >= 0) {
+        if (j >= 0 && j < size) {
             const int last = half_face_starts[j + 1];
             for (twin = half_face_starts[j]; twin < last && half_face_labels[twin] != i;)
                 ++twin;

@@ -188,7 +188,7 @@ inline bool has_label(global const int *corner_faces, int u, int label)
 
 /* Per corner u of cell i, where the faces a, b, c meet: twin_corners[u], that of the first cell before i in which the
    same four meet, or u. */
-kernel void match_corners(const int size, global const int *owners, global const int *corner_starts,
+kernel void match_corners(const int size, const int n, global const int *owners, global const int *corner_starts,
                           global const int *corner_faces, global int *twin_corners)
 {
     WORK_ITEM(u);
@@ -196,7 +196,7 @@ kernel void match_corners(const int size, global const int *owners, global const
     int best = i, found = u;
     for (int k = 0; k < 3; ++k) {
         const int j = corner_faces[3 * u + k];
-        if (j < 0 || j >= best)
+        if (j < 0 || j >= min(best, n))
             continue;
         const int one = corner_faces[3 * u + (k + 1) % 3], two = corner_faces[3 * u + (k + 2) % 3];
         for (int w = corner_starts[j]; w < corner_starts[j + 1]; ++w)

@@ -10,6 +10,7 @@ import numpy as np
 import pyopencl.array as cla
 import scipy
 
+from ...errors import InputError
 from ...finite_volumes.borders import on_surfaces
 from ...geometry.domain import ClipBox, Domain
 from ...mesh.connectivity import used_indices
@@ -17,6 +18,7 @@ from ...mesh.diagram import Diagram
 from ...opencl.engine import Engine
 from ...opencl.primitives import Gather, Lists
 from ..device_diagram import CloseError, Tessellation
+from ..part import Part
 from ..report import UNEVEN
 from ..stages import TessellationStages
 from ..tessellator import Tessellator
@@ -68,17 +70,42 @@ def fetch_diagram(engine: Engine, domain: Domain, t: Tessellation, labels: cla.A
     return diagram if sheets is None else on_surfaces(diagram, sheets, points, sizes, again)
 
 
-def make_diagram(stages: TessellationStages, domain: Domain, points: np.ndarray) -> Diagram:
-    """Return the diagram of `points` (n, d), which are in `domain`, made on the device."""
-    return fetch_diagram(stages.engine, domain, *_tessellate(stages, domain, points))
+def make_diagram(
+    stages: TessellationStages, domain: Domain, points: np.ndarray, ghosts: np.ndarray | None = None
+) -> Diagram:
+    """Return the diagram of `points` (n, d), which are in `domain`, made on the device.
+
+    `ghosts` (g, 3) are further generators in a box. They shape cells, but have none: faces towards them are on wall 0.
+    Where round-off may have spoiled the diagram, they have cells, too, which follow those of the points.
+    """
+    engine = stages.engine
+    if ghosts is not None and len(ghosts):
+        reader = _DiagramReader(engine, domain, *_tessellate(stages, domain, points, ghosts), copy=False)
+        try:
+            if not reader.needs_check():
+                return reader.diagram()
+        except InputError:
+            pass
+        del reader
+        points = np.concatenate([points, ghosts])
+    return fetch_diagram(engine, domain, *_tessellate(stages, domain, points))
 
 
-def _tessellate(stages: TessellationStages, domain: Domain, points: np.ndarray) -> tuple[Tessellation, cla.Array]:
-    """Return the tessellation of `points` (n, d) on the device, and its labels (n,): the rows of the points."""
+def _tessellate(
+    stages: TessellationStages, domain: Domain, points: np.ndarray, ghosts: np.ndarray | None = None
+) -> tuple[Tessellation, cla.Array]:
+    """Return the tessellation of `points` (n, d) on the device, and its labels (n,): the rows of the points.
+
+    `ghosts` (g, d) have no cells.
+    """
     engine, n = stages.engine, len(points)
     binned = stages.bins.build(domain, engine.upload(domain.place(points, engine.real)), n)
     labels, sorted_points = binned.items[:n].copy(), binned.points[:n].copy()
     tessellator = Tessellator(stages, domain)
+    if ghosts is not None:
+        every = np.concatenate([sorted_points.get(), domain.place(ghosts, engine.real)])
+        part = Part(n, len(every), engine.upload(every), domain)
+        return tessellator.tessellate_part(part, exact=True), labels
     stages.bins.renumber(binned, n)
     t = tessellator.final(tessellator.tessellate(sorted_points, n, exact=True, binned=binned, complete=True))
     return t, labels
@@ -119,7 +146,8 @@ def kept_faces(t: Tessellation, m: int, copy: bool) -> Tessellation:
     return Tessellation(
         n=t.n,
         points=points,
-        sites=kept(t.sites[: t.n]) if t.is_power else points,
+        sites=kept(t.sites[: t.rows]) if t.is_power or t.rows > t.n else points,
+        part=t.part,
         starts=kept(t.starts),
         neighbors=kept(t.neighbors[:m]),
         face_measures=kept(t.face_measures[:m]),
@@ -321,7 +349,7 @@ class _DiagramReader:
         """Return, for each cell of `whole`, the volume of the cones over faces that are not `kept`."""
         t, faces = self.whole, self._in_whole(np.flatnonzero(~kept))
         cell = np.searchsorted(t.starts.get(), faces, side="right") - 1
-        other, points = t.neighbors.get()[faces], t.points.get()[:, : self.engine.dim].astype(float)
+        other, points = t.neighbors.get()[faces], t.sites.get()[:, : self.engine.dim].astype(float)
         inner = other >= 0  # faces on walls are never below round-off
         way = np.linalg.norm(points[other] - points[cell], axis=1) * inner
         return np.bincount(cell, t.face_measures.get()[faces] * way / 6, t.n)
@@ -437,14 +465,14 @@ class _DiagramReader:
         return starts_of(self.counts)
 
     def neighbors(self) -> np.ndarray:
+        ranks = np.append(self.ranks, np.full(self.t.rows - self.n, -1, np.int32))
         if self.lists is not None:
-            ranks = self.engine.upload(self.ranks, np.int32)
-            return Gather(self.engine).lists(self.lists, self.t.neighbors, ranks).get()
+            return Gather(self.engine).lists(self.lists, self.t.neighbors, self.engine.upload(ranks, np.int32)).get()
         j = self._read_faces(self.t.neighbors)
         walls = np.minimum(j, -1)
         if self.cut is not None:
             walls = -1 - self.cut.edge_numbers[-1 - walls]
-        return np.where(j >= 0, self.ranks[np.maximum(j, 0)], walls)
+        return np.where(j >= 0, ranks[np.maximum(j, 0)], walls)
 
     def shifts(self) -> np.ndarray:
         assert self.codes is not None

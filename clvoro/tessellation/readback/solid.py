@@ -64,8 +64,10 @@ def make_mesh(
 
     def whole(points: np.ndarray) -> Faces:
         stages = TessellationStages(engine.replaced(traits=box.traits(engine.real)))
-        made = make_diagram(stages, box, np.concatenate([points, outer_generators(surface, points, sizes)]))
+        diagram = make_diagram(stages, box, points, outer_generators(surface, points, sizes))
+        faces = replace(diagram.faces, diagram=None)
+        del diagram.faces  # they name each other: their arrays would wait for the garbage collector
         stages.release()
-        return replace(made.faces, diagram=None)
+        return faces
 
     return solid_diagram(surface, points, sizes, whole, tell, warns)

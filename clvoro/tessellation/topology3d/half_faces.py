@@ -91,5 +91,5 @@ def list_half_faces(engine: Engine, box: ClipBox, t: Tessellation) -> HalfFaces:
     for capacity in used:
         kernel = _kernels(engine, capacity).list_corners
         clip_each(engine, kernel, capacity, n, (*cell, *lists))
-    engine.run_each(k.match_corners, c, owners, corner_starts, corner_faces, twin_corners)
+    engine.run_each(k.match_corners, c, np.int32(n), owners, corner_starts, corner_faces, twin_corners)
     return HalfFaces(corners, owners, sharpness, corner_faces, same, twin_corners, starts, labels, loop_starts, loops)

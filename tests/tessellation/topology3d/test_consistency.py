@@ -2,11 +2,14 @@
 
 import numpy as np
 import pytest
+from scipy.spatial.distance import cdist
 
 import clvoro
 from clvoro.opencl.engine import Engine
 from clvoro.tessellation.bins import Bins
 from clvoro.tessellation.polyhedra import Polyhedra
+from clvoro.tessellation.readback.diagram import _DiagramReader, make_diagram
+from clvoro.tessellation.stages import TessellationStages
 from clvoro.tessellation.topology3d.consistency import FaceSharing, share_faces
 from tests.tessellation.test_polyhedra import BOX, tessellation
 
@@ -31,13 +34,13 @@ def rows(engine, loops, behind=None):
 
 
 def test_twins_of_half_faces(engine, kernels):
-    """Two cells with a common face; a face with a neighbor that does not have it has no twin."""
-    starts, half_face_starts = [0, 2, 4, 5], [0, 2, 5, 6]
-    labels = [1, -1, -3, 0, 2, -1]
+    """Two cells with a common face; a face with a neighbor that does not have it has no twin. Cell 3 is a ghost."""
+    starts, half_face_starts = [0, 2, 4, 6], [0, 2, 5, 7]
+    labels = [1, -1, -3, 0, 2, -1, 3]
     given = (engine.upload(a, np.int32) for a in (starts, half_face_starts, labels))
-    twins = engine.empty(6, np.int32)
+    twins = engine.empty(7, np.int32)
     engine.run_each(kernels.find_twins, 3, *given, twins)
-    assert twins.get().tolist() == [3, 1, 2, 0, -1, 5]
+    assert twins.get().tolist() == [3, 1, 2, 0, -1, 5, 6]
 
 
 def without_spurs(loop):
@@ -229,3 +232,28 @@ def test_a_face_that_cannot_be_shared_is_an_error(engine, monkeypatch):
     t = tessellation(engine, Bins(engine), Polyhedra(engine), ring(40))
     with pytest.raises(clvoro.errors.InputError, match="perturb generators that lie on a common sphere"):
         share_faces(engine, BOX, t)
+
+
+@pytest.mark.parametrize("spoiled", [False, True])
+def test_ghosts_shape_cells_and_have_none(engine, monkeypatch, spoiled):
+    """Against the diagram in which they are generators, too: its first cells, with the same vertices."""
+    stages, x = TessellationStages(engine), np.random.default_rng(5).random((300, 3))
+    monkeypatch.setattr(_DiagramReader, "needs_check", lambda self: spoiled and self.t.rows > self.n)
+    whole, some = make_diagram(stages, BOX, x), make_diagram(stages, BOX, x[:200], x[200:])
+    assert len(some) == (300 if spoiled else 200)
+    faces = {}
+    for diagram in (whole, some):
+        f = diagram.faces
+        loops = [f.points[f.corners[f.starts[k] : f.starts[k + 1]]] for k in range(len(f))]
+        faces[diagram] = {(i, j): loop for i, j, loop in zip(f.owner, f.neighbor, loops, strict=True) if 0 <= j < 200}
+    assert faces[whole].keys() == faces[some].keys()
+    for key, loop in faces[some].items():
+        there = cdist(loop, faces[whole][key])
+        assert len(set(there.argmin(axis=1))) == len(loop) == there.shape[1]
+        assert there.min(axis=1).max() < 1e-14
+    np.testing.assert_allclose(some.volumes[:200], whole.volumes[:200], rtol=1e-12)
+    beyond = [
+        np.bincount(f.owner[(f.neighbor >= 200) | (f.neighbor < 0)], minlength=200)[:200]
+        for f in (whole.faces, some.faces)
+    ]
+    np.testing.assert_array_equal(*beyond)
