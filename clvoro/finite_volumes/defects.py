@@ -146,7 +146,7 @@ def _shapes(around: Neighborhood, x: np.ndarray) -> _Shapes:
     codes, sign = around.side_code[around.star], around.side_sign[around.star]
     seen[:, around.star] = centers.take(side, axis=1) - around.whole.offsets(codes)
     outward[:, around.star] = areas.take(side, axis=1) * sign
-    middles, volumes = pyramid_sums(seen, outward, around.side_cell, len(around.cells))
+    middles, volumes = pyramid_sums(lambda a: (seen[a], outward[a]), around.side_cell, len(around.cells))
     return _Shapes(centers, areas, lengths(areas) / spread, seen, outward, middles, volumes)
 
 

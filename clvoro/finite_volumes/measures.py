@@ -113,9 +113,13 @@ class SolverMeasures:
         offset = arm - (np.einsum("ij,ij->i", g.areas, arm) / along)[:, None] * line
         size = np.linalg.norm(offset, axis=1)
         direction = offset / (size + _TINY)[:, None]
-        face = np.repeat(np.arange(len(g.centers)), np.diff(p.starts))
-        reach = np.abs(np.einsum("ij,ij->i", p.points[p.corners] - g.centers[face], direction[face]))
-        extent = np.maximum(np.maximum.reduceat(reach, p.starts[:-1]), least)
+        extent = least
+        for part in slices(len(extent), _CHUNK):
+            starts = p.starts[part.start : part.stop + 1]
+            face = np.repeat(np.arange(part.start, part.start + len(starts) - 1), np.diff(starts))
+            arms = p.points.take(p.corners[starts[0] : starts[-1]], axis=0) - g.centers[face]
+            reach = np.abs(np.einsum("ij,ij->i", arms, direction[face]))
+            extent[part] = np.maximum(np.maximum.reduceat(reach, starts[:-1] - starts[0]), least[part])
         return size / (extent + _TINY)
 
     @cached_property

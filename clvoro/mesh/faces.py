@@ -125,14 +125,12 @@ class Faces(Sealed):
 
     @cached_property
     def _geometry(self) -> dict[str, np.ndarray]:
-        """Area, normal and center; those of a diagram with the distance."""
+        """Area and center; those of a diagram with normal and distance."""
         if self.diagram is not None:
             made = _geometry_of_diagram(self, self.diagram)
             return {name: read_only(values) for name, values in made.items()}
         center, vector = self.vectors
-        area = np.linalg.norm(vector, axis=1)
-        normal = vector / np.where(area > 0, area, 1)[:, None]
-        return {"area": read_only(area), "normal": read_only(normal), "center": read_only(center)}
+        return {"area": read_only(np.linalg.norm(vector, axis=1)), "center": center}
 
     @cached_property
     def vectors(self) -> tuple[np.ndarray, np.ndarray]:
@@ -157,10 +155,12 @@ class Faces(Sealed):
         """Area; length in 2D; (f,) float64."""
         return self._geometry["area"]
 
-    @property
+    @cached_property
     def normal(self) -> np.ndarray:
         """Unit normal, from owner to neighbor, or out of the domain; (f, d) float64."""
-        return self._geometry["normal"]
+        if self.diagram is not None:
+            return self._geometry["normal"]
+        return read_only(self.vectors[1] / np.where(self.area > 0, self.area, 1)[:, None])
 
     @property
     def center(self) -> np.ndarray:

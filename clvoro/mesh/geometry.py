@@ -6,6 +6,7 @@ its faces. Flat faces of convex cells get their exact centroids.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -96,25 +97,40 @@ def cell_geometry(
         Cells behind the first k faces; no other face has a cell behind it.
     cells : int
     """
-    cell = np.concatenate([owner, neighbor])
-    k = len(neighbor)
-    middles = np.concatenate([centers, centers[:k]]).T
-    outward = np.concatenate([areas, -areas[:k]]).T
-    found, volumes = pyramid_sums(middles, outward, cell, cells)
+    cell, k = np.concatenate([owner, neighbor]), len(neighbor)
+
+    def sides(axis: int) -> tuple[np.ndarray, np.ndarray]:
+        center, area = centers[:, axis], areas[:, axis]
+        return np.concatenate([center, center[:k]]), np.concatenate([area, -area[:k]])
+
+    found, volumes = pyramid_sums(sides, cell, cells)
     return np.ascontiguousarray(found.T), volumes
 
 
-def pyramid_sums(centers: np.ndarray, areas: np.ndarray, cell: np.ndarray, cells: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return centroids (3, n) and volumes (n,) of cells from the centers and outward areas (3, k) of their faces.
+def pyramid_sums(
+    sides: Callable[[int], tuple[np.ndarray, np.ndarray]], cell: np.ndarray, cells: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return centroids (3, n) and volumes (n,) of cells from their faces.
 
-    `cell` (k,) is the cell of each face.
+    Parameters
+    ----------
+    sides : callable
+        Returns of each face one component of its center, and of its outward area, (k,) each. So few columns of large
+        meshes are in memory.
+    cell : (k,) int
+        The cell of each face.
+    cells : int
     """
     counts = np.maximum(np.bincount(cell, minlength=cells), 1)
-    means = sum_columns(cell, centers, cells) / counts
-    arms = centers - means.take(cell, axis=1)
-    thrice = dots(areas, arms)
+    means, moments = np.empty((2, 3, cells))
+    thrice = np.zeros(len(cell))
+    for a in range(3):
+        center, area = sides(a)
+        means[a] = np.bincount(cell, center, cells) / counts
+        thrice += area * (center - means[a].take(cell))
     volumes = np.bincount(cell, thrice, cells)
-    moments = sum_columns(cell, thrice * arms, cells)
+    for a in range(3):
+        moments[a] = np.bincount(cell, thrice * (sides(a)[0] - means[a].take(cell)), cells)
     safe = np.where(np.abs(volumes) > _TINY**2, volumes, np.inf)
     return means + 0.75 * moments / safe, volumes / 3
 
