@@ -16,11 +16,10 @@
    labels (c,)                   of each corner: its vertex, named by its first corner
    best_corners (c,)             of each vertex: the corner that its faces determine best; its position is the vertex's
    loop_starts (h + 1,), loops   of each half-face: its corners, counter-clockwise from outside
-   twins (h,)                    the half-face on the other side; itself at a wall and towards a ghost, which has no cell;
-                                 -1 where the graph has no face
-   reduced, reduced_counts       of each half-face: its loop as vertices, without repetitions and spurs; from
-                                 loop_starts on
-   differs (h,)                  1 where a half-face and its twin do not agree */
+   twins (h,)                    the half-face on the other side; itself at a wall and towards a ghost, which has no
+   cell; -1 where the graph has no face reduced, reduced_counts       of each half-face: its loop as vertices, without
+   repetitions and spurs; from loop_starts on differs (h,)                  1 where a half-face and its twin do not
+   agree */
 
 /* Note that corners u and w belong to one vertex. Labels are read from `old` and written to `new`, which begins as its
    copy. */
