@@ -582,8 +582,8 @@ def follow_vortices(case: Case, adapter: clvoro.Adapter, mesh: Mesh, n_cells: in
     write_case(case, mesh, 100, convection, None, (begin, 0.002), period / 6)
     case.run("pimpleFoam")
     known = FoamCase(case.folder)
-    known.set_control(deltaT=0.0012 * math.sqrt(7500 / n_cells))
-    sizes = clvoro.foam.FieldSizes(forces="cylinder", h_min=0.0015)
+    known.set_control(deltaT=0.001 * math.sqrt(7500 / n_cells))
+    sizes = clvoro.foam.FieldSizes(forces="cylinder", h_min=0.001)
     rows = clvoro.foam.adapt_case(
         case.folder,
         n_cells=n_cells,
