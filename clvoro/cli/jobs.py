@@ -12,7 +12,7 @@ import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -130,7 +130,7 @@ class Job:
         OSError
             If the output cannot be written.
         """
-        size, arguments, files = self.peers.agree(self._prepare)
+        size, settings = self.peers.agree(self._prepare)
         adapter = self.peers.agree(self._make_adapter)
         device = adapter.ctx.devices[0]
         where = f"{device.platform.name.strip()} / {device.name.strip()}"
@@ -143,7 +143,7 @@ class Job:
                 for method in self.case.methods:  # the same seed: the same start
                     profile = Profile(adapter) if self.profile else None
                     with profile or nullcontext():
-                        result = self._run_one(adapter, size, method, arguments, files)
+                        result = self._run_one(adapter, size, method, settings)
                     name = str(method or result.settings.get("method", "default"))
                     results[name] = result
                     if profile is not None:
@@ -164,16 +164,16 @@ class Job:
                 )
         self.missed = any(result.stop_reason.startswith(MISSES) for result in results.values())
         self._summarize(results, where, profiles)
-        self._tell_how_to_continue(files)
+        self._tell_how_to_continue()
         if self.solver is not None and self.peers.number == 0:
             self._check_for_solver(results)
         if frames and not self.quiet and not self.as_json:
             print(frames_line(frames))
         return self.interrupted
 
-    def _prepare(self) -> tuple[Any, dict[str, Any], Checkpoint | None]:
-        """Check all that can be checked before the run; return the size field, the arguments and the checkpoint."""
-        arguments = self.case.run_arguments()
+    def _prepare(self) -> tuple[Any, dict[str, Any]]:
+        """Check all that can be checked before the run; return the size field and the settings of the run."""
+        settings = self.case.run_arguments()
         size = self._during("preparing the size field", self.case.size_field)
         warn_of_unused(self.case.run, [m or Options.method for m in self.case.methods])
         self._refuse_formats()
@@ -181,16 +181,16 @@ class Job:
         self._land = self.case.land
         self.case = self.case.with_patches(self.types)
         patch_types(self.case.domain.boundary_names, self.case.patches)
-        files = self._checkpoints()
+        state = self._state  # refuses what does not fit, before the folder is made
         named = {"checkpoint": self.checkpoint, "resume": self.resume}
         named |= {source.name: source for source in self.case.sources()}
         refuse_own_files(self.out, named)
         check_folder(self.out)
-        if files is not None and self.checkpoint is None and self.resume is None and self.peers.number == 0:
+        if state is not None and self.checkpoint is None and self.resume is None and self.peers.number == 0:
             (self.out / STATE).unlink(missing_ok=True)  # of an earlier run
         if self.report:
             require_plots()
-        return size, arguments, files
+        return size, settings
 
     def _make_adapter(self) -> Any:
         from .. import Adapter, create_context
@@ -221,9 +221,7 @@ class Job:
             given = f"format {others[0]}" if others else "check-solver"
             raise InputError(f"{given} needs the whole mesh, and pieces are given; leave --pieces out")
 
-    def _run_one(
-        self, adapter: Any, size: Any, method: str | None, settings: dict[str, Any], files: Checkpoint | None
-    ) -> Result:
+    def _run_one(self, adapter: Any, size: Any, method: str | None, settings: dict[str, Any]) -> Result:
         # Settings that only other methods of the case use are left out.
         used = {k: v for k, v in settings.items() if uses(method or Options.method, k)}
         arguments = arguments_of_run(used)
@@ -252,7 +250,12 @@ class Job:
             adapter.on_work = None if shown is None else shown.show_work
             try:
                 result: Result = adapter.run(
-                    self.case.domain, size, callback=callback, checkpoint=files, on_interrupt="return", **arguments
+                    self.case.domain,
+                    size,
+                    callback=callback,
+                    checkpoint=self._state,
+                    on_interrupt="return",
+                    **arguments,
                 )
             finally:
                 adapter.on_memory = adapter.on_build = adapter.on_work = None
@@ -305,8 +308,9 @@ class Job:
                     f"{self.case.name}: format {kind} is for meshes in 2D, and the domain is in 3D; expected openfoam"
                 )
 
-    def _checkpoints(self) -> Checkpoint | None:
-        """Return the checkpoint of the run, if any."""
+    @cached_property
+    def _state(self) -> Checkpoint | None:
+        """The checkpoint of the run, if any."""
         given = {"checkpoint": self.checkpoint, "checkpoint_every": self.checkpoint_every, "resume": self.resume}
         given = {name: value for name, value in given.items() if value is not None}
         if "checkpoint_every" in given and self.checkpoint is None:
@@ -323,16 +327,16 @@ class Job:
         every = Checkpoint.every if self.checkpoint_every is None else self.checkpoint_every
         return Checkpoint(self.checkpoint, every, self.resume)
 
-    def _tell_how_to_continue(self, files: Checkpoint | None) -> None:
+    def _tell_how_to_continue(self) -> None:
         """After an interruption, print the command that continues."""
-        if not self.interrupted or files is None or not Path(str(files.path)).exists():
+        if not self.interrupted or self._state is None or not Path(str(self._state.path)).exists():
             return
         words = list(self.command)
         for option in [word for word in words if word.startswith("--resume")]:
             at = words.index(option)
             del words[at : at + (1 if "=" in option else 2)]
         launcher = ["mpiexec", "-n", str(self.peers.count)] if self.peers.count > 1 else []
-        again = [*launcher, "clvoro", *words, "--resume", str(files.path)]
+        again = [*launcher, "clvoro", *words, "--resume", str(self._state.path)]
         print(f"clvoro: to go on: {shlex.join(again)}", file=sys.stderr)
 
     @contextmanager
