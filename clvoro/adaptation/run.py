@@ -524,7 +524,7 @@ class Run:
         parts = None
         if self._is_part:
             parts = ResultParts(mesh.engine, self._domain, CellRows.of(mesh.t, mesh.labels))
-        diagram, settings = mesh.fetch_diagram(), dict(self._settings)
+        diagram, settings = mesh.fetch_diagram(len(self._fixed)), dict(self._settings)
         if self._options.layers and self._domain.extrudes_layers:
             from ..finite_volumes.solid_walls.layers import add_layers
 

@@ -688,13 +688,16 @@ class MeshState:
         """The tessellator that made the present diagram."""
         return self.tessellator if self.power is None or not self.t.is_power else self.power
 
-    def fetch_diagram(self) -> Diagram:
-        """Return the diagram and free the buffers of all stages. The mesh cannot be used afterwards."""
+    def fetch_diagram(self, held: int = 0) -> Diagram:
+        """Return the diagram and free the buffers of all stages. The mesh cannot be used afterwards.
+
+        The first `held` generators stay where others are moved because OpenFOAM would reject cells.
+        """
         tessellator = self._latest_tessellator
         latest = [tessellator.steps.measure_exactly(self.t)]
         self.tessellation = None
         self.stages.release()
-        return fetch_part(tessellator.stages.engine.alone(), self.domain, latest.pop(), self.labels)
+        return fetch_part(tessellator.stages.engine.alone(), self.domain, latest.pop(), self.labels, held)
 
 
 def _take_apart(new: Outcome | None) -> tuple[dict[str, cla.Array], tuple[int, int]]:

@@ -56,7 +56,12 @@ class _OnSurfaces:
 
 
 def on_surfaces(
-    diagram: Diagram, sheets: Sheets, points: np.ndarray, sizes: np.ndarray, remake: Callable[[np.ndarray], Diagram]
+    diagram: Diagram,
+    sheets: Sheets,
+    points: np.ndarray,
+    sizes: np.ndarray,
+    remake: Callable[[np.ndarray], Diagram],
+    held: int = 0,
 ) -> Diagram:
     """Return a mesh whose faces between cells on both sides of `sheets` lie on them.
 
@@ -74,6 +79,8 @@ def on_surfaces(
         h at the generators.
     remake : callable
         Returns the diagram of other generators (n, 3).
+    held : int
+        How many of the first generators are not moved.
     """
     domain, first = diagram.domain, _made(diagram, sheets)
 
@@ -90,7 +97,7 @@ def on_surfaces(
     points, own = points.copy(), slice(None) if diagram.home is None else diagram.home >= 0
     points[first.home[own]] = diagram.points[own]
     return fewest_rejected(
-        first, points, sizes, lambda a: a.home[a.rejected], partial(moved, domain, depth, sizes), again
+        first, points, sizes, lambda a: a.home[a.rejected], partial(moved, domain, depth, sizes, held=held), again
     ).diagram
 
 

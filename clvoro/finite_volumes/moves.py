@@ -97,6 +97,7 @@ def moved(
     points: np.ndarray,
     rows: np.ndarray,
     move: int,
+    held: int = 0,
 ) -> np.ndarray:
     """Return all generators (n, 3). Those of `rows` (k,) int and near these are moved, but stay in the domain.
 
@@ -110,9 +111,12 @@ def moved(
         h at the generators.
     move : int
         The number of the attempt. It gives the directions.
+    held : int
+        How many of the first generators stay.
     """
     beside = scipy.spatial.KDTree(points).query_ball_point(points[rows], _BESIDE * sizes[rows])
     rows, points = np.unique(np.concatenate(beside).astype(np.int64)), points.copy()
+    rows = rows[rows >= held]
     away = np.random.default_rng(move).normal(size=(len(rows), 3))
     away *= (_MOVE * sizes[rows] / np.linalg.norm(away, axis=1))[:, None]
     sheets = None if domain.borders is None else domain.borders.sheets

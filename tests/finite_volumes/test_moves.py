@@ -10,14 +10,15 @@ H = 0.25
 CUBE = clvoro.Solid.box((0, 0, 0), (1, 1, 1))
 
 
-def in_solid(solid, x, rows, move):
-    return moved(solid, lambda at: -solid.signed_distance(at), np.full(len(x), H), x, np.array(rows), move)
+def in_solid(solid, x, rows, move, held=0):
+    return moved(solid, lambda at: -solid.signed_distance(at), np.full(len(x), H), x, np.array(rows), move, held)
 
 
 def test_generators_of_rejected_cells_are_moved_inside_of_the_solid():
     """So are those beside them. One in a corner is moved away from it; where there is no room, it stays."""
     row = 0.5 + np.array([[0, 0, 0], [1.2 * H, 0, 0], [1.4 * H, 0, 0]])
     assert (in_solid(CUBE, row, [0], 0) != row).any(axis=1).tolist() == [True, True, False]
+    assert (in_solid(CUBE, row, [0], 0, held=1) != row).any(axis=1).tolist() == [False, True, False]
     solid = clvoro.Solid.box((0, 0, 0), (1, 1, 0.25 * H))
     x = np.array([[0.5, 0.5, 0.12 * H], [0.5, 0.2, 0.13 * H], [0.12 * H, 0.12 * H, 0.12 * H], [0.3, 0.3, 0.05 * H]])
     for move in range(3):

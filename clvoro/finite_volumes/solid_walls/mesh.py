@@ -145,6 +145,7 @@ def solid_diagram(
     whole: Callable[[np.ndarray], Faces],
     tell: Callable[[str], object] = lambda _: None,
     warns: bool = True,
+    held: int = 0,
 ) -> Diagram:
     """Return the mesh of a solid as a diagram, without short edges at walls.
 
@@ -165,6 +166,8 @@ def solid_diagram(
         Called with the name of each part of the work.
     warns : bool
         Whether it warns of what is wrong with the mesh.
+    held : int
+        How many of the first generators are not moved.
 
     Raises
     ------
@@ -199,7 +202,7 @@ def solid_diagram(
         points,
         sizes,
         lambda a: a.near.numbers[a.made.home[a.made.rejected]],
-        partial(moved, surface.solid, lambda x: -surface.closest(x)[2], sizes),
+        partial(moved, surface.solid, lambda x: -surface.closest(x)[2], sizes, held=held),
         again,
     )
     near = best.near

@@ -35,13 +35,17 @@ LEFT_OUT = 1e-5
 """Largest share of a cell behind faces below round-off that may be left out without a check of the diagram."""
 
 
-def fetch_diagram(engine: Engine, domain: Domain, t: Tessellation, labels: cla.Array, copy: bool = True) -> Diagram:
+def fetch_diagram(
+    engine: Engine, domain: Domain, t: Tessellation, labels: cla.Array, copy: bool = True, held: int = 0
+) -> Diagram:
     """Return `t` as a `Diagram` with rows in the order of `labels` (n,); arrays are read when first used.
 
     Parameters
     ----------
     copy : bool
         Copy the arrays of `t`. Without a copy the caller must not reuse these buffers.
+    held : int
+        How many of the first generators are not moved where OpenFOAM would reject cells.
     """
     sheets = None if domain.borders is None else domain.borders.sheets
     if domain.curved_walls:
@@ -50,10 +54,10 @@ def fetch_diagram(engine: Engine, domain: Domain, t: Tessellation, labels: cla.A
         solid = cast("Solid", domain)
         points, sizes = read_generators(domain, t, labels)
         del t, labels  # memory for another diagram
-        diagram = make_mesh(engine, solid, points, sizes)
+        diagram = make_mesh(engine, solid, points, sizes, held=held)
 
         def again(points: np.ndarray) -> Diagram:
-            return make_mesh(engine, solid, points, sizes, warns=False, spread=False)
+            return make_mesh(engine, solid, points, sizes, warns=False, spread=False, held=held)
 
     else:
         diagram = _read(engine, domain, t, labels, copy)
@@ -67,7 +71,7 @@ def fetch_diagram(engine: Engine, domain: Domain, t: Tessellation, labels: cla.A
             stages.release()
             return made
 
-    return diagram if sheets is None else on_surfaces(diagram, sheets, points, sizes, again)
+    return diagram if sheets is None else on_surfaces(diagram, sheets, points, sizes, again, held)
 
 
 def make_diagram(

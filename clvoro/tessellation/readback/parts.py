@@ -16,10 +16,10 @@ from ..device_diagram import Tessellation
 from .diagram import fetch_diagram, order_of, starts_of
 
 
-def fetch_part(engine: Engine, domain: Domain, t: Tessellation, labels: cla.Array) -> Diagram:
+def fetch_part(engine: Engine, domain: Domain, t: Tessellation, labels: cla.Array, held: int = 0) -> Diagram:
     """Return the cells of a part in the order of `labels` (n,). Faces towards cells of part k are walls ``"rankK"``."""
     if t.part is None or t.part.ghosts is None or t.whole is None:
-        return fetch_diagram(engine, domain, t, labels, copy=False)
+        return fetch_diagram(engine, domain, t, labels, copy=False, held=held)
     order = order_of(labels.get())
     places = np.arange(t.whole.n, dtype=np.int32)
     places[order] = np.arange(t.n)

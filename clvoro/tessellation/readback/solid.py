@@ -46,13 +46,19 @@ def mesh_volumes(engine: Engine, domain: Domain, t: Tessellation, labels: cla.Ar
 
 
 def make_mesh(
-    engine: Engine, domain: Solid, points: np.ndarray, sizes: np.ndarray, warns: bool = True, spread: bool = True
+    engine: Engine,
+    domain: Solid,
+    points: np.ndarray,
+    sizes: np.ndarray,
+    warns: bool = True,
+    spread: bool = True,
+    held: int = 0,
 ) -> Diagram:
     """Return the mesh of a solid by its generators `points` (n, 3), for cells of the `sizes` (n,).
 
     In a run each cell is cut by planes of its own, and cells do not fit together. The mesh has the Voronoi cells of the
     same generators, cut at the surface. With `warns` the function warns of defects of the mesh. With `spread` those in
-    thin parts do not stay halfway between the walls.
+    thin parts do not stay halfway between the walls. The first `held` generators are not moved.
     """
     tell = engine.pool.on_work or (lambda _: None)
     tell("diagram of all cells")
@@ -70,4 +76,4 @@ def make_mesh(
         stages.release()
         return faces
 
-    return solid_diagram(surface, points, sizes, whole, tell, warns)
+    return solid_diagram(surface, points, sizes, whole, tell, warns, held)
