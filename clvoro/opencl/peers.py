@@ -189,17 +189,24 @@ class Ranks(Peers):
     def exchange(self, sent: Sequence[np.ndarray], sizes: ArrayLike | None = None) -> list[np.ndarray]:
         """Send the numbers of rows, unless all ranks know theirs, and then the rows."""
         self.exchanges += 1
-        own, found = sent[self.number], np.empty(self.count, np.int64)
-        if sizes is None:
-            self._complete([self._comm.Ialltoall(np.array([len(values) for values in sent], np.int64), found)])
-        else:
+        own, counts = sent[self.number], np.array([len(values) for values in sent], np.int64)
+        others, found = [part for part in range(self.count) if part != self.number], counts.copy()
+        told: list[Any] = []
+        if sizes is not None:
             found[:] = sizes
+        elif self.count > FEW:
+            told = [self._comm.Ialltoall(counts, found)]
+        else:
+            told = [self._comm.Irecv(found[part : part + 1], part) for part in others]
+            told += [self._comm.Isend(counts[part : part + 1], part) for part in others]
+        # The rows are on their way while the numbers arrive.
+        packed = {part: np.ascontiguousarray(sent[part]) for part in others if len(sent[part])}
+        requests = [self._comm.Isend(_bytes(values), part) for part, values in packed.items()]
+        if told:
+            self._complete(told)
         received = [np.empty((int(size), *own.shape[1:]), own.dtype) for size in found]
         received[self.number] = own
-        others = [part for part in range(self.count) if part != self.number]
-        requests = [self._comm.Irecv(_bytes(received[part]), part) for part in others if found[part]]
-        packed = {part: np.ascontiguousarray(sent[part]) for part in others if len(sent[part])}
-        requests += [self._comm.Isend(_bytes(values), part) for part, values in packed.items()]
+        requests += [self._comm.Irecv(_bytes(received[part]), part) for part in others if found[part]]
         self._complete(requests)
         return received
 
