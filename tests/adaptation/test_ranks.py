@@ -41,9 +41,9 @@ from clvoro.tessellation.part_steps import PartSteps
 ARRAYS = ("points", "volumes", "centroids", "neighbor_starts", "neighbors", "face_measures", "face_centroids")
 SCRIPT = """
 import os, resource, sys
-import clvoro
+import clvoro, numpy as np
 from clvoro.cli import main
-from clvoro.opencl import prebuild
+from clvoro.opencl import peers, prebuild
 from mpi4py import MPI
 
 prebuild._start = lambda device: None  # no workers beside the ranks
@@ -56,6 +56,20 @@ assert (whole is None) == (rank > 0)
 if whole is not None:
     assert whole.check(), whole.check()
     print(len(whole), len(mesh), whole.history["cells"][-1], file=out)
+
+def messages():
+    ranks, (mine, theirs) = peers.Ranks(MPI.COMM_WORLD), (np.full((k + 2, 2), k) for k in (rank, 1 - rank))
+    received = np.empty((len(theirs), 2), int)
+    sizes = [np.where(np.arange(2) == rank, 0, len(rows)) for rows in (mine, theirs)]
+    sums = ranks.swap(mine, sizes[0], received, sizes[1], np.array(rank))
+    assert np.array_equal(received, theirs)
+    assert np.array_equal(ranks.exchange([mine] * 2)[1 - rank], theirs)
+    assert [int(k) for k in sums] == [int(k) for k in ranks.gather(np.array(rank))] == [0, 1]
+    assert (ranks.exchanges, ranks.reductions, ranks.waits) == (2, 2, 4)
+
+messages()
+peers.FEW = 1  # as many ranks do it
+messages()
 
 def fail(row):
     if rank == 1 and row["step"] == 2:
