@@ -112,7 +112,7 @@ class BallGroups:
     """
 
     def __init__(self, centers: np.ndarray, radii: np.ndarray, chunks: Chunks) -> None:
-        self.centers, self.radii, self.chunks, firsts = centers, radii, chunks, chunks.firsts
+        self.centers, self.radii, self.chunks, firsts = centers, radii.copy(), chunks, chunks.firsts
         lower, upper = (f.reduceat(centers, firsts, axis=0) for f in (np.minimum, np.maximum))
         self.largest = np.maximum.reduceat(radii, firsts)
         self.boxes = np.hstack([lower, upper])
