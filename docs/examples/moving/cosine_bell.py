@@ -63,7 +63,7 @@ def turned(points, angle):
 def sizes(mesh, u):
     now = sizing.hessian_size(u, on=mesh, n_cells=N, h_max=0.2)
     ahead = [sizing.Estimate(mesh, now(turned(mesh.centroids, -part * turn)), now.error) for part in (0.5, 1)]
-    return sizing.normalize(sizing.combine(now, *ahead), n_cells=N, h_max=0.2)
+    return sizing.normalize(sizing.combine(now, *ahead), n_cells=N, h_max=0.2, growth=1.15)
 
 
 # %%
