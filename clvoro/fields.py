@@ -148,8 +148,10 @@ def _chosen(wanted: Iterable[str] | None, present: Iterable[str]) -> list[str]:
     """
     there = list(present)
     absent = [name for name in wanted or () if name not in there]
-    if absent or not there:
-        raise FileError(f"it has no field {', '.join(absent) or 'at all'}; it has {', '.join(there) or 'none'}")
+    if not there:
+        raise FileError("it has no fields")
+    if absent:
+        raise FileError(f"it has no field {', '.join(absent)}; it has {', '.join(there)}")
     return list(dict.fromkeys(wanted or there))
 
 

@@ -234,7 +234,7 @@ POINTS = "\n".join(f"{x},{y},{x + y}" for x in (0.1, 0.5, 0.9) for y in (0.1, 0.
         (table("x,y,u\n" + POINTS, fields=3), InputTypeError, "expected names of fields"),
         (table("x,y,u\n" + POINTS, time=np.nan), InputError, "time is nan, expected a finite number$"),
         (arrays(points=np.zeros((0, 2)), u=np.zeros((0, 1))), InputError, "u has shape|points of shape"),
-        (arrays(points=grid(2), u=3.0), InputError, "no field at all"),
+        (arrays(points=grid(2), u=3.0), InputError, "it has no fields"),
         (arrays(points=grid(2), u=np.zeros((81, 0))), InputError, r"u has shape \(81, 0\)"),
         (arrays(points=grid(2), u=np.ones(81) * 1j), InputError, "dtype complex128, expected"),
         (table("x,y,u\n0,0,nan\n1,1,3\n" + POINTS), InputError, r"u is nan at \[0.0, 0.0\], expected finite values"),

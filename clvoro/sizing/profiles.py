@@ -14,6 +14,7 @@ from .arguments import check_positive
 
 FLAT = 1e-12
 """Share of the largest derivative below which a derivative counts as 0."""
+_NOTHING = "has nothing to follow: the derivatives (or the sensor, or the weight) are 0 everywhere"
 _FIRST_STEP, _CLOSE = 0.1, 1e-7  # of the logarithm of a factor
 
 
@@ -88,7 +89,7 @@ def best_sizes(
     top = check_bounds(what, h_min, h_max, places.longest)
     largest = float(indicator.max())
     if largest == 0 and eps is not None and math.isinf(h_max):
-        raise InputError(f"{what} values have no derivatives other than 0, so eps={eps:g} gives no size; give h_max")
+        raise InputError(f"{what} {_NOTHING}, so eps={eps:g} gives no size; give h_max")
     # l in units that neither overflow nor underflow.
     shape = indicator / largest if largest > 0 else np.zeros(indicator.shape)
     shape[shape < FLAT] = 0
@@ -124,10 +125,7 @@ def scale_profile(
         If no factor gives `n_cells`.
     """
     if n_cells is not None and not np.isfinite(profile).any():
-        raise InputError(
-            f"{what} values have no derivatives other than 0, so n_cells={n_cells:g} cannot be "
-            "distributed; use a number as size"
-        )
+        raise InputError(f"{what} {_NOTHING}, so n_cells={n_cells:g} cannot be distributed; use a number as size")
 
     limit = places.limit
 
