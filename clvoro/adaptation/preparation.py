@@ -446,11 +446,11 @@ def without_far(prepared: Prepared, max_levels: int | None = None) -> Prepared:
     return replace(prepared, points=None, kept_rows=None, levels=levels, tree=tree)
 
 
-def judge_points(prepared: Prepared, mesh: MeshState) -> GivenPoints:
-    """Return how the run uses the points of the caller, whose mesh is `mesh`."""
+def judge_points(prepared: Prepared, mesh: MeshState) -> tuple[GivenPoints, Prepared]:
+    """Return how the run uses the points of the caller, whose mesh is `mesh`, and the run without far ones."""
     options, n = prepared.options, mesh.total
     if prepared.points is None or not options.multilevel:
-        return GivenPoints()
+        return GivenPoints(), prepared
     s = mesh.summaries.read()
     mean, quality = s["error"].magnitude / n, s["quality"].sum / n
     missing = mesh.missing_cells() if options.n_cells is None else float(options.n_cells - n)
@@ -458,19 +458,18 @@ def judge_points(prepared: Prepared, mesh: MeshState) -> GivenPoints:
     off = f"{abs(missing) / n:.1%} of the cells too {'few' if missing > 0 else 'many'}"
     found = f"mean |e| {mean:.2g}, {off}, mean Q {quality:.3f}"
     if near:
-        return GivenPoints(near=True, why=f"the given mesh is near and only corrected ({found})")
+        return GivenPoints(near=True, why=f"the given mesh is near and only corrected ({found})"), prepared
     if options.levels == "auto" and (after := without_far(prepared)) is not prepared:
         kept = 0 if after.kept_rows is None else np.count_nonzero(after.kept_rows >= 0)
         share = f"{1 - kept / len(prepared.points):.0%} of the given points are" if kept else "the given points are all"
-        return GivenPoints(replaced=True, why=f"{share} far from the sizes, and were replaced ({found})")
-    if prepared.levels:
-        return GivenPoints(
-            why=f"the given points are too few to be corrected: {prepared.levels} refinements led to the sizes"
-        )
-    return GivenPoints(
-        why=f"the given mesh is not near, and all steps were taken ({found}; near means at most {NEAR_ERROR:g}, "
+        return GivenPoints(replaced=True, why=f"{share} far from the sizes, and were replaced ({found})"), after
+    why = (
+        f"the given points are too few to be corrected: {prepared.levels} refinements led to the sizes"
+        if prepared.levels
+        else f"the given mesh is not near, and all steps were taken ({found}; near means at most {NEAR_ERROR:g}, "
         f"{NEAR_COUNT:.0%}, and regular cells)"
     )
+    return GivenPoints(why=why), prepared
 
 
 def plan(prepared: Prepared, given: GivenPoints) -> Plan:

@@ -179,14 +179,16 @@ class Run:
         if saved is None:
             try:
                 self.state = start(prepared)
+                if given is None:
+                    given, after = judge_points(prepared, self.state)
+                    if after is not prepared:
+                        stages.release()
+                        prepared = after
+                        self.state = start(prepared)
             except FewCellsError as error:
                 self._begin(size, points, self._fewer_levels(prepared.levels, error), given=given)
                 return
-        if given is None:
-            given = judge_points(prepared, self.state)
-            if given.replaced:
-                self._begin(size, points, given=given)
-                return
+        assert given is not None
         self.given = given
         self._size, self._points = size, points
         planned = plan(prepared, given)
