@@ -1,7 +1,7 @@
 """Runs over the ranks of MPI: bits, sizes and shapes, processor time, and what ranks exchange.
 
-    python bench/parallel.py [--ranks 1,2,4,8] [--cells 10000] [--dims 2,3] [--effort fast] [--device NAME]
-                             [--dtype float32] [--json]
+    python bench/parallel.py [--ranks 1,2,4,8] [--cells 10000] [--dims 2,3] [--effort fast] [--periodic]
+                             [--device NAME] [--dtype float32] [--json]
 
 For each number of ranks the script starts itself under `mpiexec`; with PoCL each rank has one core. `bits` says whether
 the diagram of random points has the same bits as with the first number of ranks. The other columns are of a run in a
@@ -54,7 +54,7 @@ def measure_rank(options: argparse.Namespace) -> None:
     from mpi4py import MPI
 
     dim, cells, effort, comm = options.rank, options.cells, options.effort, MPI.COMM_WORLD
-    box, rounds, ghosts, asked = clvoro.Box((0,) * dim, (1,) * dim), [], [0], [0]
+    box, rounds, ghosts, asked = clvoro.Box((0,) * dim, (1,) * dim, periodic=options.periodic), [], [0], [0]
     adapter = clvoro.Adapter(clvoro.create_context(options.device), options.dtype, comm=comm)
     finish = PartSteps._finished
 
@@ -121,6 +121,7 @@ def main() -> None:
     p.add_argument("--cells", type=int, default=10_000, help="number of cells")
     p.add_argument("--dims", type=counts, default=[2, 3], help="dimensions")
     p.add_argument("--effort", default="fast", help="effort of the run")
+    p.add_argument("--periodic", action="store_true", help="a box without walls")
     p.add_argument("--rank", type=int, help="dimension for which each rank measures; used by the script itself")
     options = p.parse_args()
     if options.rank:

@@ -40,19 +40,72 @@ inline REAL certified_radius(int i, int n, int with_ghosts, REAL factor, global 
     return radius;
 }
 
-/* sums[4 t ...] = the volumes of the generators t, t + size, ... of n; the weighted measures of their faces with
-   ghosts, positive in the cell of the lower label; those without signs; and how many of these generators are beyond
-   their limits. Over all parts the second sum is zero if each face has both sides. One work-item per t.
+/* Length of the period along axis a; 0 between walls. Positions and periods are multiples of eps, so that their sums and
+   differences are exact. */
+inline REAL period_along(int a, REAL4 periods)
+{
+    return a == 0 ? periods.s0 : a == 1 ? periods.s1 : periods.s2;
+}
+
+/* Whether y is half a period or farther from x along an axis. */
+inline bool is_far(global const REAL *x, global const REAL *y, REAL4 periods)
+{
+    bool far = false;
+    for (int a = 0; a < DIM; ++a) {
+        const REAL period = period_along(a, periods);
+        far = far || (period > 0 && 2 * fabs(y[a] - x[a]) >= period);
+    }
+    return far;
+}
+
+/* points[i] = own[i] = the image of sites[i] that is nearest to own[i]. One work-item per generator. */
+kernel void follow_images(const int size, global const REAL *sites, const REAL4 periods, global REAL *own,
+                          global REAL *points)
+{
+    WORK_ITEM(i);
+    for (int k = DIM * i; k < DIM * (i + 1); ++k) {
+        const REAL period = period_along(k - DIM * i, periods), d = sites[k] - own[k];
+        points[k] = own[k] = sites[k] + (2 * d > period ? -period : 2 * d < -period ? period : 0);
+    }
+}
+
+/* Move ghost g, points[n + g], by the periods of its code (see `Ghosts` in part.py). One work-item per ghost. */
+kernel void shift_ghosts(const int size, const int n, global const int *codes, const REAL4 periods, global REAL *points)
+{
+    WORK_ITEM(g);
+    for (int a = 0, code = codes[g]; a < DIM; ++a, code /= 3)
+        points[DIM * (n + g) + a] += (code % 3 - 1) * period_along(a, periods);
+}
+
+/* placed[i] = the image of points[i] in the domain. One work-item per row. */
+kernel void place_images(const int size, global const REAL *points, const REAL4 periods, global REAL *placed)
+{
+    WORK_ITEM(i);
+    for (int k = DIM * i; k < DIM * (i + 1); ++k) {
+        const REAL period = period_along(k - DIM * i, periods);
+        REAL x = points[k];
+        /* An image of a generator that has crossed the seam may be two periods away. */
+        for (int turn = 0; turn < 2 && period > 0; ++turn)
+            x = x < 0 ? x + period : x >= period ? x - period : x;
+        placed[k] = x;
+    }
+}
+
+/* sums[5 t ...] = the volumes of the generators t, t + size, ... of n; the weighted measures of their faces with
+   ghosts, positive in the cell of the lower label; those without signs; how many of these generators are beyond their
+   limits; and how many neighbors are half a period away or farther. Over all parts the second sum is zero if each face
+   has both sides. One work-item per t.
 
    needed[i] is the radius above. When generator i was at at[i], its part knew all generators within limits[i].s0 of it,
    and it was at least limits[i].s1 away from the balls of other parts that do not know it. */
 kernel void sum_cells(const int size, const int n, global const int *starts, global const int *neighbors,
                       global const int *labels, global const FACE *face_measures, global const REAL *volumes,
                       const int with_ghosts, const REAL factor, global const float *reach, global const REAL *points,
-                      global const REAL *at, global const float2 *limits, global float *needed, global REAL *sums)
+                      global const REAL *at, global const float2 *limits, global float *needed, const REAL4 periods,
+                      global REAL *sums)
 {
     WORK_ITEM(t);
-    REAL volume = 0, signed_sum = 0, sum = 0, beyond = 0;
+    REAL volume = 0, signed_sum = 0, sum = 0, beyond = 0, far = 0;
     for (int i = t; i < n; i += size) {
         REAL moved2 = 0;
         for (int a = 0; a < DIM; ++a) {
@@ -66,6 +119,8 @@ kernel void sum_cells(const int size, const int n, global const int *starts, glo
         volume += volumes[i];
         for (int k = starts[i]; k < starts[i + 1]; ++k) {
             const int j = neighbors[k];
+            if (j >= 0)
+                far += is_far(points + DIM * i, points + DIM * j, periods);
             if (j < n)
                 continue;
             const REAL part = face_measures[k] * weight_of_face(labels[i], labels[j]);
@@ -73,10 +128,11 @@ kernel void sum_cells(const int size, const int n, global const int *starts, glo
             sum += part;
         }
     }
-    sums[4 * t] = volume;
-    sums[4 * t + 1] = signed_sum;
-    sums[4 * t + 2] = sum;
-    sums[4 * t + 3] = beyond;
+    sums[5 * t] = volume;
+    sums[5 * t + 1] = signed_sum;
+    sums[5 * t + 2] = sum;
+    sums[5 * t + 3] = beyond;
+    sums[5 * t + 4] = far;
 }
 
 /* values[n + g] = values[rows[g]] for each ghost g. Rows of values have `words` 32-bit words of any type. A ghost

@@ -220,7 +220,7 @@ class Domain(ClipBox):
     @property
     def may_have_parts(self) -> bool:
         """Whether ranks can share a mesh of it."""
-        return self.plain and self.borders is None and self.wall_triangles is None
+        return not (self.curved or self.cuts_cells) and self.borders is None and self.wall_triangles is None
 
     @property
     def globe(self) -> Sphere | None:

@@ -195,6 +195,7 @@ class Part:
         factor: float,
         with_ghosts: bool,
         needed: cla.Array,
+        periods: np.ndarray,
     ) -> np.ndarray:
         """Return sums over own cells that prove, with those of all parts, that `t` is a part of the whole diagram.
 
@@ -209,17 +210,19 @@ class Part:
             Whether the cells of ghosts beside own cells must be final, too.
         needed : (n_own,) float32
             Receives the radii of the balls around own generators in which all generators must be known.
+        periods : (4,) real
+            Lengths of the periods; 0 between walls.
 
         Returns
         -------
-        (4,) ndarray
+        (5,) ndarray
             The volume of own cells; the signed sum of the measures of their faces with ghosts; the sum without signs;
-            the number of generators beyond their limits. The signed sums of all parts add up to zero if each face
-            between two parts has both sides.
+            the numbers of generators beyond their limits, and of neighbors half a period away or farther. The signed
+            sums of all parts add up to zero if each face between two parts has both sides.
         """
-        sums = engine.scratch((SUMS, 4))
+        sums = engine.scratch((SUMS, 5))
         given = t.starts, t.neighbors, self.labels, t.face_measures, t.volumes
-        limited = np.int32(with_ghosts), engine.real.type(factor), t.reach, self.points, at, limits, needed
+        limited = np.int32(with_ghosts), engine.real.type(factor), t.reach, self.points, at, limits, needed, periods
         kernel = engine.kernels("tessellation/part", shared=True).sum_cells
         engine.run_each(kernel, SUMS, np.int32(self.n_own), *given, *limited, sums)
         return sums.get().sum(axis=0, dtype=float)

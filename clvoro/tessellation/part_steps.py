@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 import pyopencl as cl
@@ -28,6 +29,8 @@ from ..opencl.primitives import NamedArrays
 from .cut_cells import CutCells
 from .device_diagram import Follow, Tessellation
 from .part import Ghosts, Part
+from .periodic.ghost_images import ExtendedBox
+from .periodic.images import FewCellsError
 from .polyhedra import Polyhedra
 from .stages import TessellationStages
 from .steps import DomainSteps, Sort
@@ -55,7 +58,7 @@ MOST_GHOSTS = 0.5
 cells are beside ghosts."""
 GROUP = 64
 """Number of balls in a group, if another part has sent them."""
-FAILED = np.array([0.0, 0.0, 0.0, 0.0, 1.0])
+FAILED = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
 """Sums of a part whose update has failed: nothing to those of `Part.sums`, and one to the number of such parts."""
 
 
@@ -174,12 +177,12 @@ class Answers:
     asked : (m,) int
         Numbers of those that may contain generators that this part does not know.
     facing : dict of Facing
-        By the numbers of the other parts.
+        By the numbers of the other parts, or in a periodic box of the images of all parts.
     given : list of (k,) int32
-        For each part, the own generators in its balls that it has not known.
-    new : list of (k, d + 2) float
-        The generators that each part has given: their rows there, whether the cells of this part need them, and their
-        positions.
+        For each of these, the own generators in its balls that it has not known.
+    new : list of (k, d + 3) float
+        The generators that each part has given: their rows there, whether the cells of this part need them, their
+        positions as this part sees them, and the number of the image.
     """
 
     balls: BallGroups
@@ -195,7 +198,7 @@ class Answers:
 
     def shrink(self) -> None:
         """Make the balls smaller, until the given generators, which do not become ghosts, are outside of the skins."""
-        places, balls = np.concatenate([rows[:, 2:] for rows in self.new]), self.balls
+        places, balls = np.concatenate([rows[:, 2:-1] for rows in self.new]), self.balls
         if len(places) and len(self.asked):
             tree = scipy.spatial.cKDTree(places)
             radii = balls.radii[self.asked]
@@ -251,8 +254,21 @@ class PartSteps(DomainSteps):
     def __init__(self, stages: TessellationStages, domain: Domain) -> None:
         super().__init__(stages, domain)
         self.peers, self.rounds, self.asked = stages.engine.peers, 0, 0
+        real = stages.engine.real
+        periods, self._periods = domain.periods(real), np.zeros(4, real)
+        self._periods[: domain.dim] = periods
+        self._images = np.array(list(product(*((-1, 0, 1) if along else (0,) for along in domain.periodic))))
+        self._shifts = self._images * periods
+        self._corners = [corner[: domain.dim].astype(float) for corner in domain.device_corners(real)]
+        if self.is_periodic:
+            self.box = ExtendedBox(self._corners[0] - periods, self._corners[1] + periods)
         self._room = NamedArrays(stages.engine, spare=1 / 16)
         self._labels: cla.Array | None = None
+
+    @property
+    def is_periodic(self) -> bool:
+        """Whether parts have images of generators, among them those of their own ones."""
+        return len(self._images) > 1
 
     @property
     def _reads_rows(self) -> bool:
@@ -268,25 +284,33 @@ class PartSteps(DomainSteps):
         """Return the generators, the first `n` of `sites`, with the ghosts that are known."""
         labels, engine = self._given, self.stages.engine
         self.rounds += 1
-        if self.peers.count == 1:
+        if self.peers.count == 1 and not self.is_periodic:
             return Part(n, n, sites, self.box, None, labels=labels)
-        if self._labels is not labels:
+        begins = self._labels is not labels
+        if begins:
             self._begin_anew(sites[:n].get().astype(float), labels)
-        count = n + len(self._rows)
+        count, kernels = n + len(self._rows), engine.kernels("tessellation/part", shared=True)
         points = self._room("points", size=count * engine.dim).reshape(count, -1)
-        cl.enqueue_copy(engine.queue, buffer_of(points), buffer_of(sites), byte_count=sites[:n].nbytes)
+        if self.is_periodic:
+            # Generators stay beside their neighbors when they cross a seam.
+            own = self._room("own", size=n * engine.dim)
+            if begins:
+                cl.enqueue_copy(engine.queue, buffer_of(own), buffer_of(sites), byte_count=own.nbytes)
+            engine.run_each(kernels.follow_images, n, sites, self._periods, own, points)
+        else:
+            cl.enqueue_copy(engine.queue, buffer_of(points), buffer_of(sites), byte_count=sites[:n].nbytes)
         self._ghosts.fill(engine, n, points)
+        if self.is_periodic:
+            engine.run_each(kernels.shift_ghosts, count - n, np.int32(n), self._codes, self._periods, points)
         if self._at is None:
             self._note(points)
         return Part(n, count, points, self.box, self._ghosts, labels=self._all_labels)
 
     def _begin_anew(self, x: np.ndarray, labels: cla.Array) -> None:
         """Ask for the ghosts of new generators."""
-        engine, count = self.stages.engine, self.peers.count
-        self._corners = [corner[: engine.dim].astype(float) for corner in self.box.device_corners(engine.real)]
         self._labels, self._chunks = labels, Chunks(x, *self._corners)
-        self._sent = [np.empty(0, np.int32) for _ in range(count)]
-        self._parts, self._rows = np.empty(0, int), np.empty(0, np.int32)
+        self._sent = [np.empty(0, np.int32) for _ in range(self.peers.count * len(self._shifts))]
+        self._sides, self._rows = np.empty(0, int), np.empty(0, np.int32)
         self._caps = FIRST_REACH[self._reads_rows] * self._chunks.spacings
         answers = self._ask(x, self._caps, self._caps)
         self._take(answers)
@@ -295,13 +319,17 @@ class PartSteps(DomainSteps):
 
     def _store(self) -> None:
         """Upload the lists of ghosts, and get their labels from their owners."""
-        engine, n = self.stages.engine, len(self._caps)
-        order = np.argsort(self._parts, kind="stable")
-        self._parts, self._rows = self._parts[order], self._rows[order]
-        self._ghosts = Ghosts.of_lists(engine, self.peers, self._parts, self._rows, self._sent)
+        engine, n, ways = self.stages.engine, len(self._caps), len(self._shifts)
+        order = np.argsort(self._sides, kind="stable")
+        self._sides, self._rows = self._sides[order], self._rows[order]
+        parts, way = np.divmod(self._sides, ways)
+        # The other part has this one on the opposite side.
+        sent = [np.concatenate(self._sent[k : k + ways][::-1]) for k in range(0, len(self._sent), ways)]
+        self._ghosts = Ghosts.of_lists(engine, self.peers, parts, self._rows, sent)
+        self._codes = engine.upload((self._images[way] + 1) @ 3 ** np.arange(engine.dim), np.int32)
         assert self._labels is not None
         labels = self._labels.get()[:n]
-        found = self.peers.exchange([labels[rows] for rows in self._sent])
+        found = self.peers.exchange([labels[rows] for rows in sent])
         self._all_labels = engine.upload(np.concatenate([labels, *found]), np.int32)
 
     def _note(self, points: cla.Array) -> None:
@@ -360,16 +388,26 @@ class PartSteps(DomainSteps):
         if t is not None:
             assert self._at is not None
             given = self._at, self._limits_there, 2 * (1 + NOISE[engine.real.name]), self._reads_rows, needed
-            sums = np.append(part.sums(engine, t, *given), 0)
+            sums = np.append(part.sums(engine, t, *given, self._periods), 0)
         sums = self.peers.total(sums)
         if sums[-1] or t is None:
             return None
         if sums[3] and not self._ask_again(part, needed.get().astype(float)):
             return None
+        if sums[4]:
+            raise FewCellsError(
+                f"{int(sums[4])} neighbors of generators are half a period away or farther, expected at least four or "
+                f"five cells across each period of {self.domain}; use a smaller size, more cells (n_cells) or fewer "
+                "levels"
+            )
         self._check(*sums[:3])
         whole = t if t.n == part.count else None
-        own = t.first(n) if t.n > n else t
-        return replace(own, part=part, whole=whole, points=part.points, sites=part.points)
+        own, points = t.first(n) if t.n > n else t, part.points
+        if self.is_periodic:
+            points = self._room("placed", size=points.size).reshape(points.shape)
+            place = engine.kernels("tessellation/part", shared=True).place_images
+            engine.run_each(place, part.count, part.points, self._periods, points)
+        return replace(own, part=part, whole=whole, points=points, sites=part.points)
 
     def _check(self, volume: float, gap: float, faces: float) -> None:
         """Raise if the cells of all parts do not fill the domain, or a face between two parts has only one side."""
@@ -412,27 +450,41 @@ class PartSteps(DomainSteps):
             Radii of the balls to ask for, and of the balls that the present cells need.
         """
         self.asked += 1
-        peers, balls = self.peers, BallGroups(x, radii, self._chunks)
-        told = peers.exchange([balls.facts] * peers.count)
-        facing = {number: balls.facing(told[number]) for number in range(peers.count) if number != peers.number}
+        peers, balls, ways = self.peers, BallGroups(x, radii, self._chunks), len(self._shifts)
+        told, facing = peers.exchange([balls.facts] * peers.count), {}
+        for side in range(len(self._sent)):
+            number, way = divmod(side, ways)
+            if number != peers.number or self._images[way].any():
+                facts = told[number].copy()
+                facts[:, :-2] += np.tile(self._shifts[way], 2)
+                facing[side] = balls.facing(facts)
         none = np.empty(0, int)
-        asked = [balls.meeting(facing[number]) if number in facing else none for number in range(peers.count)]
+        asked = [balls.meeting(facing[side]) if side in facing else none for side in range(len(self._sent))]
         sizes = np.column_stack([needed, (1 + SKIN) * radii])
-        wanted = peers.exchange([np.hstack([x[rows], sizes[rows]]) for rows in asked])
-        given, sent = [], []
-        for requested, known in zip(wanted, self._sent, strict=True):
-            rows, places = self._unknown(balls, requested, known)
-            necessary = inside(places, requested[:, :-1])
-            given.append(rows)
-            sent.append(np.column_stack([rows, necessary, places]))
+        requests = [np.hstack([x[rows] - self._shifts[side % ways], sizes[rows]]) for side, rows in enumerate(asked)]
+        given, sent = [none] * len(asked), []
+        for number, requested in enumerate(peers.exchange(self._joined(requests))):
+            answers = []
+            for way, shift in enumerate(self._shifts):
+                balls_there, opposite = requested[requested[:, -1] == way, :-1], ways * (number + 1) - 1 - way
+                rows, places = self._unknown(balls, balls_there, self._sent[opposite])
+                given[opposite] = rows
+                answers.append(np.column_stack([rows, inside(places, balls_there[:, :-1]), places + shift]))
+            sent += self._joined(answers)
         return Answers(balls, np.unique(np.concatenate(asked)), facing, given, peers.exchange(sent))
+
+    def _joined(self, tables: list[np.ndarray]) -> list[np.ndarray]:
+        """Return one array for each part, of those for all of its sides; a last column is the number of the way."""
+        ways = len(self._shifts)
+        numbered = [np.column_stack([rows, np.full(len(rows), k % ways)]) for k, rows in enumerate(tables)]
+        return [np.concatenate(numbered[k : k + ways]) for k in range(0, len(numbered), ways)]
 
     def _take(self, answers: Answers) -> None:
         """Add the generators that parts have given each other to the lists of ghosts."""
         self._sent = [np.concatenate(pair) for pair in zip(self._sent, answers.given, strict=True)]
-        numbers = np.repeat(np.arange(len(answers.new)), [len(rows) for rows in answers.new])
+        sides = [len(self._shifts) * number + rows[:, -1].astype(int) for number, rows in enumerate(answers.new)]
         rows = np.concatenate([rows[:, 0] for rows in answers.new]).astype(np.int32)
-        self._parts, self._rows = np.concatenate([self._parts, numbers]), np.concatenate([self._rows, rows])
+        self._sides, self._rows = np.concatenate([self._sides, *sides]), np.concatenate([self._rows, rows])
 
     def _limit(self, answers: Answers) -> None:
         """Set the limits of own generators."""
@@ -465,7 +517,7 @@ class PartSteps(DomainSteps):
         """
         n, sizes = len(balls.radii), self._chunks.sizes
         free, room = np.full(n, np.inf), np.full(n, np.inf)
-        for number, f in facing.items():
+        for side, f in facing.items():
             largest, skins = f.facts[:, -2], f.facts[:, -1]
             ways, rooms = (
                 np.repeat(values, sizes)
@@ -474,6 +526,6 @@ class PartSteps(DomainSteps):
             gap, skin, largest = f.ways, skins[f.others], largest[f.others]
             np.minimum.at(ways, f.places, gap)
             np.minimum.at(rooms, f.places, np.maximum(skin, gap - np.maximum(largest, FREE * gap)))
-            rooms[self._sent[number]] = np.inf
+            rooms[self._sent[side]] = np.inf
             free, room = np.minimum(free, FREE * ways), np.minimum(room, rooms)
         return np.maximum(balls.radii, free), room

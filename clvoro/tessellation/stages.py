@@ -88,6 +88,15 @@ class TessellationStages:
         traits = traits._replace(macros=(*traits.macros, "WEIGHTED"), site_values=1)
         return TessellationStages(self.engine.replaced(traits=traits))
 
+    @cached_property
+    def unfolded(self) -> TessellationStages:
+        """The stages for parts, which take images as ghosts; they share workspace and kernels with these."""
+        traits = self.engine.traits
+        if not traits.periods:
+            return self
+        macros = tuple(name for name in traits.macros if name != "PERIODIC")
+        return TessellationStages(self.engine.replaced(traits=traits._replace(macros=macros, periods=())))
+
     def clear_folded_cells(self) -> None:
         """Free the buffers of `folded_cells`, if it exists; its kernels stay."""
         cells = vars(self).get("folded_cells")

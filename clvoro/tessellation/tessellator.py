@@ -65,6 +65,7 @@ class Tessellator:
         self.domain, self.weighted = domain, weighted
         self.stages = stages.weighted if weighted else stages
         if stages.engine.peers.shared:
+            self.stages = self.stages.unfolded
             self.steps: DomainSteps = PartSteps(self.stages, domain)
         elif any(domain.periodic):
             halo = None if coarser is None else coarser.steps.halo

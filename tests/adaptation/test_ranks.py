@@ -36,6 +36,7 @@ from clvoro.opencl import memory_limits
 from clvoro.opencl.engine import Engine
 from clvoro.opencl.peers import Peers
 from clvoro.opencl.threads import Team
+from clvoro.tessellation import part_steps
 from clvoro.tessellation.part_steps import PartSteps
 
 ARRAYS = ("points", "volumes", "centroids", "neighbor_starts", "neighbors", "face_measures", "face_centroids")
@@ -119,26 +120,30 @@ def ramp(h):
     return lambda p: h * (1 + 2 * p[:, 0])
 
 
-@pytest.mark.sparse(2)
+@pytest.mark.sparse(3)
+@pytest.mark.parametrize("periodic", [False, True])
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
 @pytest.mark.parametrize("dim", [2, 3])
-def test_the_diagram_has_the_same_bits_in_any_number_of_parts(ctx, dim, dtype):
-    """Clusters of very different density, so that balls reach far: ghosts are enough, or bits differ."""
+def test_the_diagram_has_the_same_bits_in_any_number_of_parts(ctx, dim, dtype, periodic):
+    """Clusters of very different density, so that balls reach far: ghosts are enough, or bits differ.
+
+    The whole of a periodic box is made anew from the generators, but its errors and qualities come from the parts.
+    """
     rng = np.random.default_rng(70101)
-    x = np.concatenate([rng.random((150, dim)), 0.3 + 0.02 * rng.standard_normal((150, dim))])
-    given = clvoro.Box((0,) * dim, (1,) * dim), 0.1
+    x = np.concatenate([rng.random((150, dim)), (0.3 + 0.02 * rng.standard_normal((150, dim))) % 1])
+    given = clvoro.Box((0,) * dim, (1,) * dim, periodic=(periodic, periodic, False)[:dim]), 0.1
     options = {"points": x.astype(dtype), "method": "lloyd", "max_steps": 0, "dtype": dtype}
     meshes = [run_in(parts, ctx, *given, **options)[1] for parts in (1, 2, 4)]
     plain = clvoro.Adapter(ctx, dtype).diagram(given[0], options["points"])
     assert np.allclose(meshes[0].volumes, plain.volumes, rtol=1e-3 if dtype == "float32" else 1e-9)
     for mesh in meshes[1:]:
-        for name in ARRAYS:
+        for name in (*ARRAYS, "size_error", "quality"):
             assert np.array_equal(getattr(mesh, name), getattr(meshes[0], name)), name
 
 
 @pytest.mark.parametrize("dim", [2, 3])
 def test_steps_have_the_same_bits_in_any_number_of_parts(ctx, dim, monkeypatch):
-    """Generators move by Lloyd's algorithm. Cells are made anew at first, and updated later."""
+    """Generators move by Lloyd's algorithm, across a seam, too. Cells are made anew at first, and updated later."""
     updated, update = [], PartSteps.update
 
     def noted(steps, *given):
@@ -147,13 +152,44 @@ def test_steps_have_the_same_bits_in_any_number_of_parts(ctx, dim, monkeypatch):
         return found
 
     monkeypatch.setattr(PartSteps, "update", noted)
-    box = clvoro.Box((0,) * dim, (6, *[1] * (dim - 1)))
+    monkeypatch.setattr(part_steps, "MOST_GHOSTS", 2)
+    box = clvoro.Box((0,) * dim, (6, *[1] * (dim - 1)), periodic=(True, *[False] * (dim - 1)))
     x = np.random.default_rng(70102).random((800, dim)) * box.extent
-    one, two, three = (run_in(parts, ctx, box, 0.1, points=x, method="lloyd", max_steps=6)[1] for parts in (1, 2, 3))
+    one, two, three = (
+        run_in(parts, ctx, box, 0.1, points=x, method="lloyd", max_steps=2 * dim + 4)[1] for parts in (1, 2, 3)
+    )
     assert {(1, True), (2, True)} <= set(updated)
     for mesh in (two, three):
-        assert np.array_equal(mesh.points, one.points)
-        assert np.array_equal(mesh.neighbors, one.neighbors)
+        for name in ("points", "neighbors", "size_error", "quality"):
+            assert np.array_equal(getattr(mesh, name), getattr(one, name)), name
+    assert np.abs(one.points[:, 0] - x[:, 0]).max() > 5
+
+
+def test_a_run_in_parts_of_a_periodic_box(ctx, tmp_path):
+    """A whole run, from levels of few cells on; a checkpoint; what has too few cells across a period is refused."""
+    given = clvoro.Box((0, 0), (1, 1), periodic=True), lambda p: 0.08 * (1.5 + np.sin(2 * np.pi * p[:, 0]))
+    alone = clvoro.Adapter(ctx).run(*given, effort="fast")
+    stopped = clvoro.Checkpoint(tmp_path / "state", 0)
+    run_in(2, ctx, *given, effort="fast", checkpoint=stopped, callback=lambda row: row["step"] == 30)
+    meshes, whole = run_in(
+        3, ctx, *given, effort="fast", path=tmp_path / "mesh.pvtu", checkpoint=clvoro.Checkpoint(resume=stopped.path)
+    )
+    assert whole.check()
+    assert abs(len(whole) / len(alone) - 1) < 0.03
+    assert abs(whole.history["mean_quality"][-1] - alone.history["mean_quality"][-1]) < 0.01
+    for mesh in meshes:
+        assert mesh.diagram.domain.measure == pytest.approx(mesh.volumes.sum())
+        assert {name for name in mesh.domain.boundary_names if len(mesh.boundary_cells(name))} <= {
+            "rank0",
+            "rank1",
+            "rank2",
+        }
+    x = np.random.default_rng(70104).random((9, 2))
+    with pytest.raises(InputError, match="half a period away"):
+        run_in(2, ctx, given[0], 0.3, points=x, method="lloyd", max_steps=0)
+    assert run_in(2, ctx, given[0], 0.1, points=np.random.default_rng(1).random((90, 2)), method="lloyd", max_steps=0)[
+        1
+    ].check()
 
 
 @pytest.mark.parametrize("dim", [2, 3])

@@ -214,7 +214,7 @@ class _DiagramReader:
         self.labels = labels.get()[: t.n]
         self.m = int(t.starts[t.n].get())
         self.t = self.whole = kept_faces(t, self.m, copy)
-        self.box: ClipBox = domain
+        self.box: ClipBox = domain if t.part is None else t.part.box
         self.places: np.ndarray | None = None
         self.codes: np.ndarray | None = None
         self.cut: CutFaces | None = None

@@ -2,31 +2,50 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pyopencl.array as cla
 
+from ...geometry.box import Box
 from ...geometry.domain import Domain
 from ...mesh.diagram import Diagram
 from ...mesh.subset import take_subset
 from ...opencl.engine import Engine
 from ...opencl.peers import Peers
 from ..device_diagram import Tessellation
+from ..stages import TessellationStages
+from ..tessellator import Tessellator
 from .diagram import fetch_diagram, order_of, starts_of
 
 
 def fetch_part(engine: Engine, domain: Domain, t: Tessellation, labels: cla.Array, held: int = 0) -> Diagram:
     """Return the cells of a part in the order of `labels` (n,). Faces towards cells of part k are walls ``"rankK"``."""
+    if t.part is not None and t.part.peers is not None and t.part.peers.count == 1:
+        rows = CellRows.of(t, labels).gather(t.part.peers)
+        assert rows is not None
+        return rows.diagram(engine, domain)
     if t.part is None or t.part.ghosts is None or t.whole is None:
         return fetch_diagram(engine, domain, t, labels, copy=False, held=held)
     order = order_of(labels.get())
     places = np.arange(t.whole.n, dtype=np.int32)
     places[order] = np.arange(t.n)
-    diagram = fetch_diagram(engine, domain, t.whole, engine.upload(places, np.int32), copy=False)
+    labels = engine.upload(places, np.int32)
+    diagram = fetch_diagram(engine, unfolded(domain), replace(t.whole, part=t.part), labels, copy=False)
     names = np.full(t.whole.n, "", object)
     names[t.n :] = [f"rank{part}" for part in t.part.ghosts.parts]
     return take_subset(diagram, np.arange(t.whole.n) < t.n, names)
+
+
+def unfolded(domain: Domain) -> Domain:
+    """Return a domain with the generators of a part of `domain` and their ghosts: without periods, but larger."""
+    if not any(domain.periodic):
+        return domain
+    room = np.where(domain.periodic, domain.extent, 0)
+    names = {name: np.flatnonzero(domain.boundary_index == k) for k, name in enumerate(domain.boundary_names)}
+    found = Box(tuple(domain.lower - room), tuple(domain.upper + room), names=names)
+    object.__setattr__(found, "framed_by", domain)
+    return found
 
 
 @dataclass(frozen=True)
@@ -82,7 +101,15 @@ class CellRows:
         return CellRows(labels[order], counts, cells, faces, int(round_off))
 
     def diagram(self, engine: Engine, domain: Domain) -> Diagram:
-        """Return the diagram of these cells, if they are all of the domain, in the order of labels."""
+        """Return the diagram of these cells, if they are all of the domain, in the order of labels.
+
+        In a periodic box it is made anew, since vertices are those of cells on both sides of a seam.
+        """
+        if any(domain.periodic):
+            engine = engine.replaced(traits=domain.traits(engine.real))
+            points, tessellator = engine.upload(self.cells[0]), Tessellator(TessellationStages(engine), domain)
+            t = tessellator.tessellate(points, len(points), exact=True, complete=True)
+            return fetch_diagram(engine, domain, tessellator.final(t), engine.upload(np.arange(t.n), np.int32))
         neighbors, measures, centroids = self.faces
         rows = np.where(neighbors < 0, neighbors, np.searchsorted(self.labels, neighbors))
         points, volumes, offsets, covariances = (engine.upload(array, array.dtype) for array in self.cells)
