@@ -40,8 +40,8 @@ inline REAL certified_radius(int i, int n, int with_ghosts, REAL factor, global 
     return radius;
 }
 
-/* Length of the period along axis a; 0 between walls. Positions and periods are multiples of eps, so that their sums and
-   differences are exact. */
+/* Length of the period along axis a; 0 between walls. Positions and periods are multiples of eps, so that their sums
+   and differences are exact. */
 inline REAL period_along(int a, REAL4 periods)
 {
     return a == 0 ? periods.s0 : a == 1 ? periods.s1 : periods.s2;
@@ -78,7 +78,7 @@ kernel void shift_ghosts(const int size, const int n, global const int *codes, c
 }
 
 /* placed[i] = the image of points[i] in the domain. One work-item per row. */
-kernel void place_images(const int size, global const REAL *points, const REAL4 periods, global REAL *placed)
+kernel void place_unfolded(const int size, global const REAL *points, const REAL4 periods, global REAL *placed)
 {
     WORK_ITEM(i);
     for (int k = DIM * i; k < DIM * (i + 1); ++k) {

@@ -114,6 +114,18 @@ class Ghosts:
                     engine.run_each(kernels.unpack_rows, g, np.int32(n_own), taken, *which, array)
         return totals
 
+    def shift(self, engine: Engine, n_own: int, periods: np.ndarray, points: cla.Array) -> None:
+        """Move the ghosts in `points`, rows from `n_own` on, by the periods of their codes; `periods` (4,) real."""
+        shift = engine.kernels("tessellation/part", shared=True).shift_ghosts
+        engine.run_each(shift, len(self.parts), np.int32(n_own), self.codes, periods, points)
+
+
+def follow_images(
+    engine: Engine, n: int, sites: cla.Array, periods: np.ndarray, own: cla.Array, points: cla.Array
+) -> None:
+    """Set the first `n` of `points`, and of `own`, to the images of `sites` that are nearest to `own`."""
+    engine.run_each(engine.kernels("tessellation/part", shared=True).follow_images, n, sites, periods, own, points)
+
 
 @dataclass(frozen=True)
 class Part:
@@ -185,6 +197,11 @@ class Part:
         t = replace(t, face_measures=engine.empty(m), face_centroids=engine.empty((m, engine.dim)))
         self.order_rows(engine, t, {**defines, "FACE": engine.name_of(engine.real)})
         return t
+
+    def place_unfolded(self, engine: Engine, periods: np.ndarray, placed: cla.Array) -> None:
+        """Set `placed` (count, d) to the images in the domain of the points of this part; `periods` (4,) real."""
+        place = engine.kernels("tessellation/part", shared=True).place_unfolded
+        engine.run_each(place, self.count, self.points, periods, placed)
 
     def sums(
         self,

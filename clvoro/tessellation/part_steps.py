@@ -28,7 +28,7 @@ from ..opencl.device_array import buffer_of
 from ..opencl.primitives import NamedArrays
 from .cut_cells import CutCells
 from .device_diagram import Follow, Tessellation
-from .part import Ghosts, Part
+from .part import Ghosts, Part, follow_images
 from .periodic.ghost_images import ExtendedBox
 from .periodic.images import FewCellsError
 from .polyhedra import Polyhedra
@@ -289,19 +289,19 @@ class PartSteps(DomainSteps):
         begins = self._labels is not labels
         if begins:
             self._begin_anew(sites[:n].get().astype(float), labels)
-        count, kernels = n + len(self._rows), engine.kernels("tessellation/part", shared=True)
+        count = n + len(self._rows)
         points = self._room("points", size=count * engine.dim).reshape(count, -1)
         if self.is_periodic:
             # Generators stay beside their neighbors when they cross a seam.
             own = self._room("own", size=n * engine.dim)
             if begins:
                 cl.enqueue_copy(engine.queue, buffer_of(own), buffer_of(sites), byte_count=own.nbytes)
-            engine.run_each(kernels.follow_images, n, sites, self._periods, own, points)
+            follow_images(engine, n, sites, self._periods, own, points)
         else:
             cl.enqueue_copy(engine.queue, buffer_of(points), buffer_of(sites), byte_count=sites[:n].nbytes)
         self._ghosts.fill(engine, n, points)
         if self.is_periodic:
-            engine.run_each(kernels.shift_ghosts, count - n, np.int32(n), self._codes, self._periods, points)
+            self._ghosts.shift(engine, n, self._periods, points)
         if self._at is None:
             self._note(points)
         return Part(n, count, points, self.box, self._ghosts, labels=self._all_labels)
@@ -325,8 +325,8 @@ class PartSteps(DomainSteps):
         parts, way = np.divmod(self._sides, ways)
         # The other part has this one on the opposite side.
         sent = [np.concatenate(self._sent[k : k + ways][::-1]) for k in range(0, len(self._sent), ways)]
-        self._ghosts = Ghosts.of_lists(engine, self.peers, parts, self._rows, sent)
-        self._codes = engine.upload((self._images[way] + 1) @ 3 ** np.arange(engine.dim), np.int32)
+        codes = engine.upload((self._images[way] + 1) @ 3 ** np.arange(engine.dim), np.int32)
+        self._ghosts = replace(Ghosts.of_lists(engine, self.peers, parts, self._rows, sent), codes=codes)
         assert self._labels is not None
         labels = self._labels.get()[:n]
         found = self.peers.exchange([labels[rows] for rows in sent])
@@ -405,8 +405,7 @@ class PartSteps(DomainSteps):
         own, points = t.first(n) if t.n > n else t, part.points
         if self.is_periodic:
             points = self._room("placed", size=points.size).reshape(points.shape)
-            place = engine.kernels("tessellation/part", shared=True).place_images
-            engine.run_each(place, part.count, part.points, self._periods, points)
+            part.place_unfolded(engine, self._periods, points)
         return replace(own, part=part, whole=whole, points=points, sites=part.points)
 
     def _check(self, volume: float, gap: float, faces: float) -> None:

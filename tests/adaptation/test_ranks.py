@@ -169,8 +169,8 @@ def test_a_run_in_parts_of_a_periodic_box(ctx, tmp_path):
     """A whole run, from levels of few cells on; a checkpoint; what has too few cells across a period is refused."""
     given = clvoro.Box((0, 0), (1, 1), periodic=True), lambda p: 0.08 * (1.5 + np.sin(2 * np.pi * p[:, 0]))
     alone = clvoro.Adapter(ctx).run(*given, effort="fast")
-    stopped = clvoro.Checkpoint(tmp_path / "state", 0)
-    run_in(2, ctx, *given, effort="fast", checkpoint=stopped, callback=lambda row: row["step"] == 30)
+    stopped = clvoro.Checkpoint(tmp_path / "state")
+    run_in(2, ctx, *given, effort="fast", checkpoint=stopped, callback=lambda row: row["step"] == 20)
     meshes, whole = run_in(
         3, ctx, *given, effort="fast", path=tmp_path / "mesh.pvtu", checkpoint=clvoro.Checkpoint(resume=stopped.path)
     )
