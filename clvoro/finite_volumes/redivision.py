@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..geometry.polygon import Polygon
 from ..mesh.connectivity import following
 from ..mesh.faces import Faces
 from ..mesh.geometry import turns
@@ -124,6 +125,7 @@ class _Edit:
 
     def __init__(self, mesh: Faces, parts: np.ndarray) -> None:
         self.old, self.parts = mesh, parts
+        self.domain: Polygon = mesh.domain  # type: ignore[assignment]
         self.points = list(mesh.points)
         face = mesh.sides()[1]
         begin, end = mesh.side_ends()
@@ -208,7 +210,7 @@ class _Edit:
             for a, b, beyond in local[near]:
                 if beyond == cell:
                     middle = (self.points[a] + self.points[b]) / 2
-                    beyond = -1 - int(self.old.domain.closest_walls(middle[None])[0])
+                    beyond = -1 - int(self.domain.closest_walls(middle[None])[0])
                 loop.append((a, b, beyond))
             loops[near] = loop
         return loops.get(other, local[other]), loops
@@ -268,8 +270,11 @@ class _Edit:
         count, step = len(outline), len(SHARES) + 1
         corner = np.array([self.points[side[0]] for side in outline])
         way = np.roll(corner, -1, axis=0) - corner
-        inner = np.array([side[2] >= 0 for side in outline])
+        beyond = np.array([side[2] for side in outline])
+        inner, walls = beyond >= 0, np.repeat(-1 - beyond[beyond < 0], len(SHARES))
         x = corner[:, None] + np.array([0, *SHARES])[:, None] * way[:, None]
+        if self.domain.curves:
+            x[~inner, 1:] = self.domain.on_curve(x[~inner, 1:].reshape(-1, 2), walls).reshape(-1, len(SHARES), 2)
         x[:, 1:] += (BESIDE * inner[:, None] * np.column_stack([-way[:, 1], way[:, 0]]))[:, None]
         x = x.reshape(-1, 2)
         ahead = np.repeat(way / np.maximum(np.hypot(*way.T), 1e-300)[:, None], step, axis=0)
@@ -298,11 +303,11 @@ class _Edit:
         found = []
         for k in chosen[np.argsort(-round_[chosen], kind="stable")][:TRIED].tolist():
             (first, f), (last, g) = divmod(int(i[k]), step), divmod(int(j[k]), step)
-            a, b, beyond = outline[first]
+            a, b, near = outline[first]
             c, d, far = outline[last]
             p, q = -2 if f else a, -3 if g else c
-            one = [(p, b, beyond), *outline[first + 1 : last], *([(c, q, far)] if g else [])]
-            two = [(q, d, far), *outline[last + 1 :], *outline[:first], *([(a, p, beyond)] if f else [])]
+            one = [(p, b, near), *outline[first + 1 : last], *([(c, q, far)] if g else [])]
+            two = [(q, d, far), *outline[last + 1 :], *outline[:first], *([(a, p, near)] if f else [])]
             new = {name: place for name, place in ((p, x[i[k]]), (q, x[j[k]])) if name < 0}
             found.append(_Cut(one, two, (p, q), new))
         return found
