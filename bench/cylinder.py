@@ -20,8 +20,8 @@ channel below the axis of the cylinder, with the mirror images of its generators
 "Followed" begins as that mesh, with as many cells as the row says, and follows the solution: `clvoro.foam.adapt_case`
 makes a new mesh --cycles times from U. No place is named. With "forces" the goal are the forces on the cylinder, by the
 distance from it (`FieldSizes(forces="cylinder")`); with "adjoints" drag and lift, by their adjoint velocities, which
-`adjointOptimisationFoam` solves for. At Re 100 the flow is solved on 2,000 cells first, and followed in ten periods of
-shedding.
+`adjointOptimisationFoam` solves for; with "fluxes" cells count by the flux of momentum, too. At Re 100 the flow is
+solved on 2,000 cells first, and followed in ten periods of shedding.
 
 With --samples several meshes are made for each row, with counts that differ by one percent and with other seeds:
 shown are the median, the range, and of five or more the standard error of the median. With --again the last sizes of
@@ -166,6 +166,10 @@ FOLLOWED: dict[str, tuple[clvoro.foam.FieldSizes, str]] = {
     "followed": (clvoro.foam.FieldSizes(), "simpleFoam"),
     "followed, forces": (clvoro.foam.FieldSizes(forces="cylinder"), "simpleFoam"),
     "followed, adjoints": (clvoro.foam.FieldSizes(adjoints=("Uadrag", "Ualift")), "adjointOptimisationFoam"),
+    "followed, fluxes": (
+        clvoro.foam.FieldSizes(adjoints=("Uadrag", "Ualift"), viscosity=VISCOSITY),
+        "adjointOptimisationFoam",
+    ),
 }
 """Sizes and solvers of meshes that follow the solution at Re 20; at Re 100 all have those for forces."""
 

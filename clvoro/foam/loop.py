@@ -90,6 +90,9 @@ class FieldSizes:
         Adjoint velocities among the case's fields, such as "Ua" of ``adjointOptimisationFoam``, one for each goal:
         cells count by the largest gradient of these (`steepness`). They are compared as they are: equal errors of the
         goals count alike, such as .001 of two coefficients. A larger weight of its objective makes a goal count more.
+    viscosity : float, optional
+        Kinematic viscosity, with `adjoints`. An error e of the velocity, the first of `fields`, changes the flux of
+        momentum through a face by ``(speed + viscosity / h) e``: cells count by this, too.
     p : float, optional
         As for `hessian_size`. By default 2, and 1 for a goal.
     h_min, h_max, growth : float
@@ -103,6 +106,7 @@ class FieldSizes:
     h_min: float = 0.0
     h_max: float = math.inf
     growth: float = 1.2
+    viscosity: float | None = None
 
     def __post_init__(self) -> None:
         for what, names in (("fields", self.fields), ("adjoints", self.adjoints)):
@@ -112,6 +116,10 @@ class FieldSizes:
             raise InputError("fields is empty, expected names, such as ('U', 'p')")
         if self.forces and self.adjoints:
             raise InputError(f"got forces={self.forces!r} and adjoints={self.adjoints!r}, expected one of them")
+        if self.viscosity is not None:
+            check_number("viscosity", self.viscosity, least=0)
+            if not self.adjoints:
+                raise InputError(f"viscosity is {self.viscosity!r} without adjoints, expected both; name adjoints=")
 
     def __call__(self, found: Mapping[str, np.ndarray], on: Diagram, n_cells: int) -> Estimate:
         """Return the estimate from values in cells, (n,) or (n, d), by the names of the fields."""
@@ -129,6 +137,9 @@ class FieldSizes:
             weight = force_weight(self.forces, on)
         elif self.adjoints:
             weight = np.maximum.reduce([steepness(found[name], on) for name in self.adjoints])
+            if self.viscosity is not None:
+                speed = np.linalg.norm(np.atleast_2d(found[self.fields[0]].T), axis=0)
+                weight = weight * (speed + self.viscosity * on.volumes ** (-1 / on.domain.cell_dim))
         p = self.p or (2.0 if weight is None else 1.0)
         bounds: dict[str, Any] = {"p": p, "h_min": self.h_min, "h_max": self.h_max, "growth": self.growth}
         return hessian_size([found[f] for f in self.fields], on=on, n_cells=n_cells, weight=weight, **bounds)

@@ -491,6 +491,20 @@ def test_wrong_fields_are_refused():
             foam.FieldSizes(**options)
     with pytest.raises(InputError, match="one of them"):
         foam.FieldSizes(forces="body", adjoints=["Ua"])
+    with pytest.raises(InputError, match="name adjoints="):
+        foam.FieldSizes(viscosity=0.1)
+
+
+def test_adjoints_count_by_the_flux_of_momentum():
+    """The weight of a cell is the gradient of the adjoint velocity times speed + viscosity / h."""
+    mesh = clvoro.adapt(clvoro.Box((0, 0), (1, 1)), 0.08, "fast").diagram
+    x, y = mesh.centroids.T
+    found = {"U": np.column_stack([y**3, 0.5 * x**2]), "Ua": np.column_stack([np.sin(3 * y), x * y])}
+    made = foam.FieldSizes(adjoints=["Ua"], viscosity=0.02)(found, mesh, 200)
+    flux = np.hypot(*found["U"].T) + 0.02 / np.sqrt(mesh.volumes)
+    weight = sizing.steepness(found["Ua"], mesh) * flux
+    expected = sizing.hessian_size(found["U"], on=mesh, n_cells=200, p=1, weight=weight)
+    assert made.values == pytest.approx(expected.values, rel=1e-12)
 
 
 def test_fields_that_are_lost_are_named(case):
