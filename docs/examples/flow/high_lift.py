@@ -11,12 +11,12 @@ from clvoro import sizing
 from clvoro.curves import circle, naca, spline
 
 # %%
-# The main element is a spline with three corners: the trailing edge and both ends of the cove into which the flap
-# retracts. Slat and flap are NACA sections. All lengths are in chords.
+# The main element is a spline with three corners: both ends of its blunt trailing edge, and the front end of the cove
+# into which the flap retracts. Slat and flap are NACA sections. All lengths are in chords.
 
 main = spline(
     [
-        (0.86, 0.048),
+        (0.86, 0.05),
         (0.7, 0.078),
         (0.5, 0.1),
         (0.3, 0.102),
@@ -31,9 +31,10 @@ main = spline(
         (0.64, 0.0),
         (0.69, 0.024),
         (0.76, 0.036),
+        (0.86, 0.046),
     ],
     closed=True,
-    corners=[0, 11],
+    corners=[0, 11, 15],
     name="main",
 )
 slat = naca("4415", chord=0.18, leading_edge=(-0.14, -0.06), angle_of_attack=-35, name="slat")
