@@ -93,6 +93,55 @@ def test_openfoam_accepts_them_in_parallel(meshes, tmp_path, name):
     assert "Mesh OK." in done.stdout, done.stdout[-3000:] + done.stderr[-1000:]
 
 
+@pytest.mark.slow
+@pytest.mark.skipif(not shutil.which("laplacianFoam") or not shutil.which("mpirun.openmpi"), reason="needs OpenFOAM")
+@pytest.mark.parametrize("name", ["periodic plane", "space", "periodic space"])
+def test_a_solver_has_the_same_solution_in_parallel(meshes, tmp_path, name):
+    """One implicit step of diffusion from random values, on one processor and on three."""
+    mesh = meshes[name]
+    mesh.to_openfoam(tmp_path / "case.foam", processors=3, check=False)
+    cells = [numbers(tmp_path / f"processor{k}/constant/polyMesh/cellProcAddressing") for k in range(3)]
+    before = np.random.default_rng(7).random(len(mesh))
+    files = {
+        "constant/transportProperties": "DT [0 2 -1 0 0 0 0] 0.01;",
+        "system/controlDict": "startTime 0; endTime 1; deltaT 1; writeControl timeStep; writeInterval 1;"
+        " writePrecision 16;",
+        "system/fvSchemes": "ddtSchemes { default Euler; } gradSchemes { default Gauss linear; }"
+        " divSchemes { default none; } laplacianSchemes { default Gauss linear uncorrected; }"
+        " interpolationSchemes { default linear; } snGradSchemes { default uncorrected; }",
+        "system/fvSolution": "solvers { T { solver PCG; preconditioner DIC; tolerance 1e-14; relTol 0; } }"
+        " SIMPLE { nNonOrthogonalCorrectors 0; }",
+    }
+    kinds = ("cyclic", "empty", "processor", "processorCyclic")
+    sides = " ".join(f"{kind} {{ type {kind}; value uniform 0; }}" for kind in kinds) + " wall { type zeroGradient; }"
+    for folder, own in zip(("", "processor0/", "processor1/", "processor2/"), (slice(None), *cells), strict=True):
+        values = " ".join(map(repr, before[own].tolist()))
+        files[f"{folder}0/T"] = (
+            f"dimensions [0 0 0 1 0 0 0]; internalField nonuniform List<scalar> {len(before[own])} ({values});"
+            f" boundaryField {{ {sides} }}"
+        )
+    for path, text in files.items():
+        (tmp_path / path).parent.mkdir(exist_ok=True)
+        kind = "volScalarField" if path.endswith("T") else "dictionary"
+        about = f"FoamFile {{ version 2.0; format ascii; class {kind}; object {path.split('/')[-1]}; }}"
+        (tmp_path / path).write_text(f"{about}\n{text}\n")
+    settings = {"WM_PROJECT_DIR": str(_DEBIAN), "FOAM_ETC": str(_DEBIAN / "etc"), "PATH": "/usr/bin:/bin"}
+    parallel = ["mpirun.openmpi", "--allow-run-as-root", "--oversubscribe", "-n", "3", "laplacianFoam", "-parallel"]
+    for command in (["laplacianFoam"], parallel):
+        done = subprocess.run(
+            [*command, "-case", str(tmp_path)], env=settings, capture_output=True, text=True, check=False
+        )
+        assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-1000:]
+
+    def solution(folder):
+        return np.array((folder / "1/T").read_text().partition("(")[2].partition(")")[0].split(), float)
+
+    whole = solution(tmp_path)
+    assert np.abs(whole - before).max() > 0.01
+    for k, own in enumerate(cells):
+        assert np.abs(solution(tmp_path / f"processor{k}") - whole[own]).max() < 1e-11
+
+
 def test_what_is_refused(meshes, tmp_path):
     """Each call works with what the error says."""
     mesh = meshes["plane"]
