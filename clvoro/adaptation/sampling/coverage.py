@@ -210,7 +210,7 @@ class SolidCoverage(CutCoverage):
         cut = self.domain.meets_wall(corners[:, 0], corners[:, 1])
         self._cut[rows] = cut
         center = corners.mean(axis=1)
-        self.share[rows] = self.domain.covers(center)
+        self.share[rows[~cut]] = self.domain.covers(center[~cut])
         self.inner[rows] = center
         rows, corners, center = rows[cut], corners[cut], center[cut]
         if not rows.size:
@@ -226,7 +226,9 @@ class SolidCoverage(CutCoverage):
         self.inner[rows[any_inside]] = x[np.arange(len(rows)), best][any_inside]
         # A part thinner than the distance of samples, or one on the surface: a point just inside of it.
         depth = 1e-3 * (corners[:, 1] - corners[:, 0]).min(axis=1)
-        thin = np.flatnonzero(~any_inside | ~self.domain.contains_well(self.inner[rows], 1e-6 * depth.min()))
+        good = any_inside
+        good[good] = self.domain.contains_well(self.inner[rows[good]], 1e-6 * depth.min())
+        thin = np.flatnonzero(~good)
         found = self.domain.just_inside(self.inner[rows[thin]], depth[thin])
         there = ((found > corners[thin, 0]) & (found < corners[thin, 1])).all(axis=1)
         there &= self.domain.contains_well(found, 1e-6 * depth.min())

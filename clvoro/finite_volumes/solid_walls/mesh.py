@@ -360,9 +360,9 @@ def _simplify(walls: np.ndarray, near: NearWalls, rejected: np.ndarray) -> None:
         EXACT, FILLED or ROUNDED.
     rejected : (k,) int
     """
-    cells, p = near.cells, len(near.rows)
-    between = (cells.owner < p) & (cells.neighbor >= 0) & (cells.neighbor < p)
-    one, other = cells.owner[between], cells.neighbor[between]
+    p = len(near.rows)
+    between = near.cells.neighbor < p
+    one, other = near.cells.owner[between], near.cells.neighbor[between]
     one, other = np.concatenate([one, other]), np.concatenate([other, one])
     mine = np.zeros(p + 1, bool)
     mine[rejected] = True
@@ -419,7 +419,7 @@ class _Maker:
     def __init__(self, surface: WallSurface, near: NearWalls, walls: np.ndarray) -> None:
         self.surface = surface
         self.tree, self.sizes, self.generators = scipy.spatial.KDTree(near.generators), near.sizes, near.generators
-        self.cells = near.cells.within(len(self.sizes))
+        self.cells = near.cells
         self.owner, self.neighbor = self.cells.owner, self.cells.neighbor
         self.starts, self.corners, self.points = self.cells.starts, self.cells.corners, self.cells.points
         self.n, self.at_wall = len(self.sizes), near.at_wall

@@ -5,7 +5,7 @@ All other cells of the solid are one cell meanwhile, the rest. So the work depen
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -21,7 +21,7 @@ _RINGS = 2
 
 @dataclass(frozen=True)
 class CellFaces:
-    """Faces of cells that are closed."""
+    """Faces between cells."""
 
     owner: np.ndarray
     neighbor: np.ndarray
@@ -33,19 +33,6 @@ class CellFaces:
     """(v, 3) float."""
     row: np.ndarray
     """(f,) int. The face of the diagram that each is."""
-
-    def within(self, n: int) -> CellFaces:
-        """Return the faces between two of the first `n` cells."""
-        rows = np.flatnonzero((self.owner < n) & (self.neighbor >= 0) & (self.neighbor < n))
-        starts, corners = take_rows(self.starts, self.corners, rows)
-        return replace(
-            self,
-            owner=self.owner[rows],
-            neighbor=self.neighbor[rows],
-            starts=starts,
-            corners=corners,
-            row=self.row[rows],
-        )
 
 
 @dataclass(frozen=True)
@@ -65,7 +52,7 @@ class NearWalls:
     generators, sizes : (p + 1, 3), (p + 1,) float
         Those of the rest are far away.
     cells : CellFaces
-        Outer cells have the numbers from p + 1 on.
+        Without those towards outer cells.
     """
 
     faces: Faces
@@ -95,11 +82,11 @@ class NearWalls:
             near[n:] = False
         rows = np.flatnonzero(near)
         p = len(rows)
-        number = np.full(faces.n_cells, p)
-        number[rows], number[n:] = np.arange(p), p + 1 + np.arange(faces.n_cells - n)
+        number = np.full(n, p)
+        number[rows] = np.arange(p)
         taken = _faces_of(faces, near)
-        owner, neighbor = number[faces.owner[taken]], faces.neighbor[taken].astype(np.int64)
-        neighbor[neighbor >= 0] = number[neighbor[neighbor >= 0]]
+        taken = taken[(faces.owner[taken] < n) & (faces.neighbor[taken] >= 0) & (faces.neighbor[taken] < n)]
+        owner, neighbor = number[faces.owner[taken]], number[faces.neighbor[taken]]
         turned = owner == p
         owner[turned], neighbor[turned] = neighbor[turned], p
         starts, corners = take_rows(faces.starts, faces.corners, taken, turned)
