@@ -1,9 +1,9 @@
 """A part of the generators of a domain: those with cells, and the ghosts that shape these cells.
 
 Ghosts are images of generators beyond periodic boundaries, generators of another part, whose halo they form, or
-auxiliary generators outside of a polygon. Rows of a part are numbered by its own generators, then by its ghosts, and
-the diagram of a part names neighbors by these rows. A stage that reads ``values[neighbors[k]]`` takes the diagram of a
-part as it is, with arrays of all rows whose ghosts `Part.forward` has filled.
+auxiliary generators outside of a polygon or a solid. Rows of a part are numbered by its own generators, then by its
+ghosts, and the diagram of a part names neighbors by these rows. A stage that reads ``values[neighbors[k]]`` takes the
+diagram of a part as it is, with arrays of all rows whose ghosts `Part.forward` has filled.
 
 The diagram of a periodic box is folded as the last step (`GhostImages.fold`): neighbors name the owners of images.
 Values then need no ghosts, steps need no launch to fill them, and an update needs no images. Kernels that compute the
