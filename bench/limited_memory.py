@@ -1,13 +1,13 @@
 """A run on devices that each may hold a share of what the mesh needs: refused in one part, done in several.
 
-    python bench/limited_memory.py [--cells 200000] [--share 0.1] [--ranks 12] [--dim 2] [--effort fast]
+    python bench/limited_memory.py [--cells 60000] [--share 0.2] [--ranks 16] [--dim 2] [--effort fast]
                                    [--device NAME] [--dtype float32] [--json]
 
 `CLVORO_MEMORY_LIMIT` lets a process take a share of the memory that one device needs for the run. In one part the run
 is refused before it begins. Over ranks, each a process with the same limit, it is done, and its pieces are written.
 `needed` is the estimate for a part, and `taken` what the rank with the most has taken, in MiB as the limit. Parts have
-ghosts besides their own cells, and up to a tenth more cells than the mean: so a tenth of the memory takes more than ten
-parts. Needs `pip install -e '.[mpi]'`.
+ghosts besides their own cells, and up to a tenth more cells than the mean: a share of the memory takes more than its
+inverse in parts. Needs `pip install -e '.[mpi]'`.
 """
 
 from __future__ import annotations
@@ -57,9 +57,9 @@ def run_rank(options: argparse.Namespace) -> None:
 def main() -> None:
     """Run in one part and over ranks, and print a table."""
     p = parser(__doc__)
-    p.add_argument("--cells", type=lambda text: round(float(text)), default=200_000)
-    p.add_argument("--share", type=float, default=0.1, help="what a device may hold, over what the mesh needs")
-    p.add_argument("--ranks", type=int, default=12, help="number of parts")
+    p.add_argument("--cells", type=lambda text: round(float(text)), default=60_000)
+    p.add_argument("--share", type=float, default=0.2, help="what a device may hold, over what the mesh needs")
+    p.add_argument("--ranks", type=int, default=16, help="number of parts")
     p.add_argument("--dim", type=int, choices=(2, 3), default=2)
     p.add_argument("--effort", choices=("fast", "default", "best"), default="fast")
     p.add_argument("--folder", help="of the pieces; used by the script itself")
