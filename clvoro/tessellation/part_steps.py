@@ -45,7 +45,7 @@ JUMP = 8
 GROWTH, SKIN = 1.4, 0.15
 """Radius of the balls of a part, over that of the balls that its cells need. Width of the skin around each ball, as a
 share of this radius: a part asks for the generators in the skin, too, because they may move into the ball."""
-NEAR, FREE = 1.6, 0.8
+NEAR, FREE = 1.2, 0.8
 """A group of balls that is farther from the generators of another part than so many radii of the largest ball is
 compared as a whole. Radius around a generator in which all others are known, over its distance from other parts."""
 NOISE = {"float64": 1e-6, "float32": 1e-4}
