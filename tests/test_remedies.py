@@ -1017,7 +1017,6 @@ TESTED_IN = {
     "expected a list of names, indices": "adaptation/test_ranks.py::test_devices_share_a_run",
     "expected one of them; leave one out": "adaptation/test_ranks.py::test_devices_share_a_run",
     "let parts of the mesh share it": "adaptation/test_ranks.py::test_devices_share_a_run",
-    "neighbors of generators are half a period": "adaptation/test_ranks.py::test_a_run_in_parts_of_a_periodic_box",
     "as rank 0 has; give all ranks": "adaptation/test_ranks.py::test_parts_with_other_input_are_refused",
     "one process has the whole mesh": "adaptation/test_ranks.py::test_what_the_command_refuses_over_ranks",
     "needs the whole mesh, and pieces": "adaptation/test_ranks.py::test_what_the_command_refuses_over_ranks",

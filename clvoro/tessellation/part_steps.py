@@ -46,8 +46,9 @@ GROWTH, SKIN = 1.4, 0.15
 """Radius of the balls of a part, over that of the balls that its cells need. Width of the skin around each ball, as a
 share of this radius: a part asks for the generators in the skin, too, because they may move into the ball."""
 NEAR, FREE = 1.2, 0.8
-"""A group of balls that is farther from the generators of another part than so many radii of the largest ball is
-compared as a whole. Radius around a generator in which all others are known, over its distance from other parts."""
+"""A ball and a box of another part are compared if they are not farther apart than so many radii of the largest ball of
+both. Radius around a generator in which all others are known, over its distance from other parts."""
+EXTREMES = np.minimum, np.maximum
 NOISE = {"float64": 1e-6, "float32": 1e-4}
 """Bound of the round-off of a reach, as a share of it."""
 FILLED, MATCHED = {"float64": 1e-8, "float32": 1e-3}, {"float64": 1e-5, "float32": 1e-3}
@@ -116,29 +117,40 @@ class BallGroups:
 
     def __init__(self, centers: np.ndarray, radii: np.ndarray, chunks: Chunks) -> None:
         self.centers, self.radii, self.chunks, firsts = centers, radii.copy(), chunks, chunks.firsts
-        lower, upper = (f.reduceat(centers, firsts, axis=0) for f in (np.minimum, np.maximum))
+        lower, upper = (f.reduceat(centers, firsts, axis=0) for f in EXTREMES)
         self.largest = np.maximum.reduceat(radii, firsts)
         self.boxes = np.hstack([lower, upper])
         self.facts = np.column_stack([self.boxes, self.largest, SKIN * np.minimum.reduceat(radii, firsts)])
 
     def facing(self, facts: np.ndarray) -> Facing:
         """Return how far these balls are from the boxes of another part, which has sent its `facts` (k, 2 d + 2)."""
-        boxes, largest = facts[:, :-2], facts[:, -2]
-        away = gaps(self.boxes, around(boxes))[:, 0]
-        reach = NEAR * np.maximum(self.largest, largest.max())
-        near = np.flatnonzero(away <= reach)
-        groups, others = np.nonzero(gaps(self.boxes[near], boxes) <= reach[near, None])
-        groups = near[groups]
-        sizes = self.chunks.sizes[groups]
-        places = np.repeat(self.chunks.firsts[groups] - np.cumsum(sizes) + sizes, sizes) + np.arange(sizes.sum())
-        others = np.repeat(others, sizes)
-        dim, ways2 = self.centers.shape[1], np.zeros(len(places))
+        boxes, largest, sizes = facts[:, :-2], facts[:, -2], self.chunks.sizes
+        dim, hull, own = self.centers.shape[1], around(boxes), np.repeat(self.largest, sizes)
+        away = np.repeat(gaps(self.boxes, hull)[:, 0], sizes)
+        near = np.flatnonzero(away <= NEAR * np.maximum(own, largest.max()))
+        away[near] = gaps(np.tile(self.centers[near], 2), hull)[:, 0]
+        near = near[away[near] <= NEAR * np.maximum(own[near], largest.max())]
+        groups = np.repeat(np.arange(len(sizes)), sizes)[near]
+        firsts = np.flatnonzero(np.diff(groups, prepend=-1))
+        counts = np.diff(np.append(firsts, len(near)))
+        centers = self.centers[near]
+        lower, upper = (f.reduceat(centers, firsts, axis=0) if len(near) else centers for f in EXTREMES)
+        meets = gaps(np.hstack([lower, upper]), boxes) <= NEAR * np.maximum.outer(own[near[firsts]], largest)
+        # A ball is compared with all boxes near its group.
+        per_group = meets.sum(axis=1)
+        numbers, begins = (np.repeat(values, counts) for values in (per_group, np.cumsum(per_group) - per_group))
+        begins += numbers - np.cumsum(numbers)
+        others = np.nonzero(meets)[1][np.repeat(begins, numbers) + np.arange(numbers.sum())]
+        places = np.repeat(near, numbers)
+        ways2 = np.zeros(len(places))
         for axis in range(dim):
             x = self.centers[places, axis]
             way = np.maximum(np.maximum(boxes[others, axis] - x, x - boxes[others, dim + axis]), 0)
             ways2 += way * way
-        away[near] = reach[near]
-        return Facing(facts, away, places, others, np.sqrt(ways2))
+        ways = np.sqrt(ways2)
+        kept = ways <= NEAR * np.maximum(own[places], largest[others])
+        away[near] = np.maximum(away[near], NEAR * own[near])
+        return Facing(facts, away, places[kept], others[kept], ways[kept])
 
     def meeting(self, facing: Facing) -> np.ndarray:
         """Return which balls, with their skins, meet a box in which the other part has generators, (m,) int."""
@@ -153,10 +165,11 @@ class Facing:
     ----------
     facts : (m, 2 d + 2) float
         Facts about the groups of the other part; see `BallGroups`.
-    away : (k,) float
-        Lower bound of the distance of each group from the boxes with which its balls have no pairs.
+    away : (n,) float
+        Lower bound of the distance of each ball's center from the boxes with which it has no pairs. This distance is
+        also at least `NEAR` times the largest radius in such a box.
     places, others, ways : (p,) int, int, float
-        Pairs of a ball and a box, and the distances of its center from this box.
+        Pairs of a ball and a box in the order of balls, and the distances of the ball's center from this box.
     """
 
     facts: np.ndarray
@@ -514,17 +527,19 @@ class PartSteps(DomainSteps):
         A generator that another part does not know is at least a skin away from each ball of that part. Far from all
         other parts, the radius of a ball is a share of the distance to them.
         """
-        n, sizes = len(balls.radii), self._chunks.sizes
+        n = len(balls.radii)
         free, room = np.full(n, np.inf), np.full(n, np.inf)
         for side, f in facing.items():
             largest, skins = f.facts[:, -2], f.facts[:, -1]
-            ways, rooms = (
-                np.repeat(values, sizes)
-                for values in (f.away, np.maximum(skins.min(), f.away - np.maximum(largest.max(), FREE * f.away)))
-            )
-            gap, skin, largest = f.ways, skins[f.others], largest[f.others]
-            np.minimum.at(ways, f.places, gap)
-            np.minimum.at(rooms, f.places, np.maximum(skin, gap - np.maximum(largest, FREE * gap)))
+            ways = f.away.copy()
+            rooms = np.maximum(ways - np.maximum(largest.max(), FREE * ways), ways * (1 - max(1 / NEAR, FREE)))
+            rooms = np.maximum(skins.min(), rooms)
+            if len(f.places):
+                firsts = np.flatnonzero(np.diff(f.places, prepend=-1))
+                rows, skin, largest = f.places[firsts], skins[f.others], largest[f.others]
+                rooms_there = np.maximum(skin, f.ways - np.maximum(largest, FREE * f.ways))
+                ways[rows] = np.minimum(ways[rows], np.minimum.reduceat(f.ways, firsts))
+                rooms[rows] = np.minimum(rooms[rows], np.minimum.reduceat(rooms_there, firsts))
             rooms[self._sent[side]] = np.inf
             free, room = np.minimum(free, FREE * ways), np.minimum(room, rooms)
         return np.maximum(balls.radii, free), room
