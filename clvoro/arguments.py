@@ -19,11 +19,11 @@ if TYPE_CHECKING:
     from .geometry.domain import Domain
 
 WARNING: ContextVar[Callable[[str, type[Warning]], object] | None] = ContextVar("WARNING", default=None)
-"""What gives the warnings of this thread in place of `warn`."""
+"""A function that `warn` calls with message and category instead of giving the warning; each thread has its own."""
 
 
 def warn(message: str, category: type[Warning]) -> None:
-    """Warn at the line outside of clvoro from which its function was called, or as `WARNING` says."""
+    """Warn at the line outside of clvoro from which its function was called, or call `WARNING` instead."""
     if (other := WARNING.get()) is not None:
         other(message, category)
         return

@@ -9,8 +9,8 @@ Lengths are over h, the target size, unless they say otherwise. e is the error o
 NEAR_ERROR, NEAR_COUNT = 0.15, 0.02
 """Mean |e|, and share of missing cells, up to which a given mesh is only corrected."""
 FAR, STRETCH = 1.6, 16.0
-"""Ratio of lengths from which given points are far from the sizes and replaced, and points that are counted together,
-given and expected ones."""
+"""Ratio of given to expected spacing, or its inverse, from which given points are replaced; number of points, given and
+expected, of the pieces of the domain in which this ratio is taken."""
 DEFICIT_3D = 0.36
 """1 - mean Q in 3D up to which a given mesh counts as smoothed."""
 WALL_DEFICIT = 0.49
@@ -63,7 +63,8 @@ POLISH_COUNT_3D, POLISH_GROWTH_3D = 5e-3, 1.016
 SAMPLING_GAIN = 0.26
 """Factor on the error of the number of cells, by sizes at the generators, from one level to the next finer one."""
 LEAST_PROGRESS, MAX_OSCILLATIONS = 0.9, 2
-"""Corrections of the number of cells end after so many changes of sign without falling to this share."""
+"""Corrections of the number of cells end after `MAX_OSCILLATIONS` changes of sign, unless they have fallen to the share
+`LEAST_PROGRESS` of earlier ones."""
 CLIMB_STRAIN = 0.06
 """Strain across a dislocation (a 5-sided and a 7-sided cell) above which it climbs."""
 WALL_STRAIN = 0.3
@@ -106,7 +107,7 @@ SINGLE_LEVEL_QUALITY_SCALE = 0.15
 POLISH_MOMENTUM_3D, POLISH_RATE_3D = 0.5, 0.055
 """Share of the last displacement, and step length, of polishing in 3D, where the weight of cells is about 7.5."""
 LOOSE_POLISH_3D, SETTLE_PENALTY_3D = 2.0, 0.7
-"""Polishing in 3D aims at so many times the error target; one projection with this penalty then meets it."""
+"""Error target of polishing in 3D over that of the run; penalty of the one projection that then meets the latter."""
 PENALTY_PER_ERROR = 750.0
 """Largest penalty over the error target, for targets above 0.004. The smallest penalty is 1e-3, or a smaller target."""
 AT_WALLS, AT_WALLS_OF_BOXES = 2.0, 10.0

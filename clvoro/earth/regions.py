@@ -151,7 +151,7 @@ def ocean(
     blockages : array, list of arrays, shapely geometry, path or dict, optional
         Lines along which cells become land, unless a passage crosses them.
     least_cells : int, optional
-        Keep all parts of at least so many cells. By default only the part with the largest area.
+        Least number of cells of a part that is kept. By default only the part with the largest area.
     straits : {"keep", "widen"}
         With "widen" land beside water that is a single cell wide becomes water: straits, passages and inlets are then
         two cells wide or more. No land bridge opens, no island disappears, and blockages stay.

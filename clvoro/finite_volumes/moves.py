@@ -15,22 +15,21 @@ from ..mesh.connectivity import distinct
 
 T = TypeVar("T")
 FEW = 0.03
-"""Largest share of generators that are moved, or that may have no cell."""
+"""Largest share of generators with rejected cells for which meshes are made again, and of generators without cells."""
 _MOVES = 4
-"""How often generators of rejected cells are moved, at most."""
+"""Largest number of attempts to move the generators of rejected cells."""
 _MOVE, _BESIDE = 0.15, 1.3
-"""How far they are moved, over h. Generators nearer to them than the second number, over h, are moved as well."""
+"""Displacement of the generator of a rejected cell, and distance from it up to which others move as well, over h."""
 _GROUP = 4.0
-"""Rejected cells nearer to each other than this, over h, are one group."""
+"""Distance over h up to which rejected cells are in one group."""
 _DEEP = 0.1
-"""Least depth of moved generators in the domain, over h."""
+"""Least distance of moved generators from the boundary of the domain, over h."""
 _NEAR, _MIRRORED = 0.75, 0.2
-"""Generators nearer to a patch inside than the first number, over h, may be one of a pair. Its mirror image in the
-patch is nearer to the other one than the second number, over h."""
+"""Largest distances of paired generators from a surface, and of one from the mirror image of the other, over h."""
 _SLANTED = 0.2
-"""Normals of patches span a further direction if their singular value is more than this share of the largest."""
+"""Least singular value, over the largest, of a direction that the normals of the patches at a pair span."""
 _FREE = 0.9
-"""Moved generators that are no pair do not come nearer to patches inside than this, over h."""
+"""Least distance between surfaces inside and moved generators without a partner, over h."""
 
 
 def fewest_rejected(

@@ -22,32 +22,32 @@ from .prisms import simple_loops
 from .short_edges import STRAIGHT
 
 WORST = {"skewness": 3.5, "non_orthogonality": 60.0, "weight": 0.07, "volume_ratio": 0.015, "determinant": 2e-3}
-"""What cells may have after a cut; limits of OpenFOAM are a little farther."""
+"""Limits of the measures of cells after a cut, a little stricter than OpenFOAM's."""
 SMALLER = ("weight", "volume_ratio", "determinant")
-"""Measures of which small values are bad."""
+"""Measures with a lower limit; the others have an upper one."""
 SHARES = (0.25, 0.5, 0.75)
-"""Where a cut may end on a side, besides in its ends."""
+"""Places on a side where a cut may end, as shares of its length; a cut may also end in corners."""
 BESIDE = 0.05
-"""How far a new point on a face is moved off its other cell, over the length of the face, so that this stays convex."""
+"""Displacement of a new point on a face, over its length: away from the cell beyond, which stays convex."""
 LEAST_SHARE = 0.15
-"""Least share of the area that a cut gives to each of both cells."""
+"""Least area of each half of a cut polygon, as a share of the whole."""
 FLAT, MOST_FILLED = 1e-3, (0.1, 1.0)
-"""Turn, in radians, of a wall within two cells up to which it is made straight, and the area that they may gain by it
-at each point, over their own: the second one where the first does not help."""
+"""Largest turn, in radians, of a wall that is made straight. Largest area that a polygon gains there, over its own: the
+second value is for cells that no cut with the first one helps."""
 SHARPEST = 0.1
 """Least sine of the angles between a cut and the sides on which it ends."""
 TRIED = 24
-"""Cuts of one polygon whose measures are computed: those with the roundest halves."""
+"""Largest number of cuts of one polygon whose measures are computed: those with the roundest halves."""
 RINGS = 2
-"""Rings of cells around two that are divided whose faces are computed; the outermost is not judged."""
+"""Rings of cells, around the two that are divided, whose faces are computed. Scores leave out the outermost ring."""
 FAR = 10
-"""How many of the nearest cells a cell may share that has no faces, or only with cells that are no better."""
+"""Number of nearest cells of which one may be cut for a rejected cell, if cuts of its neighbors do not help."""
 ROUNDS = 4
 
 Side = tuple[int, int, int]
-"""First and last point of a side with the cell on the left, and the cell beyond it; -1 - wall on a wall."""
+"""First and last point of a side, counter-clockwise around its cell, and the cell beyond; on a wall -1 - wall."""
 Loops = dict[int, list[Side]]
-"""The sides of cells."""
+"""The sides of each cell, by its number."""
 
 
 def redivide(mesh: Faces, parts: np.ndarray, rejected: np.ndarray) -> Faces:

@@ -15,7 +15,7 @@ from ..mesh.faces import Faces
 from .seams import faces_with_seams
 
 _ROUNDS = 8
-"""How often rejected cells are tried to be made better."""
+"""Largest number of attempts to improve rejected cells."""
 _LARGE_CHANGE = 0.01
 """Change of the domain's area, as a share of it, beyond which there is a warning."""
 

@@ -20,7 +20,7 @@ from ..files import LONGEST_GEOMETRY, read_text
 
 _GEOGRAPHIC = re.compile(r"CRS:?84\b|EPSG:[\d.]*:?4326\b|WGS ?84$", re.IGNORECASE)
 _ALIKE = 0.95  # lengths of degrees of longitude and latitude with at least this ratio count as equal
-_FAR = 3  # a domain so many times its extent away from the equator has longitudes and latitudes
+_FAR = 3  # distance from the equator, over the extent, from which coordinates are longitudes and latitudes
 FOREIGN = (".shp", ".gpkg", ".kml", ".gml", ".fgb")
 """Files of maps that GeoPandas and GDAL read."""
 _DEEPEST = 8  # nested parentheses: a MULTIPOLYGON has three, and GEOS uses a stack frame for each

@@ -25,7 +25,7 @@ from .domain import LARGEST_EDGE
 SHORTEST_EDGE = 1e-12
 """Shortest edge, as a share of the bounding box's longest edge."""
 REPAIRED = 1e-10
-"""Shortest edge of repaired rings over the extent of the domain, and their least area over its square."""
+"""Least length of the edges of repaired rings over the extent of the domain; least area of a ring over its square."""
 _RESOLUTION = 2.0**-40
 """Smallest extent, as a share of the largest coordinate: 12 bits are left of float64's 52."""
 WALL_CORNER = np.pi / 6

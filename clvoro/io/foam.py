@@ -69,7 +69,7 @@ def cyclic_patches(mesh: Faces, apart: bool = False) -> tuple[list[FoamPatch], n
 
 
 _ENDS = (("Min", "Max"), ("Max", "Min"))
-"""Ends of an axis in the names of two patches at a seam, the upper one first: for a shift below 0, and above 0."""
+"""Ends of an axis in the names of the upper and the lower patch at a seam, for a shift below 0 and above 0."""
 PatchType = Literal["wall", "patch", "symmetry", "symmetryPlane"]
 """Types of patches for `poly_mesh`."""
 _OPEN_PARTS = ("inlet", "outlet", "inflow", "outflow", "farfield", "freestream", "atmosphere")

@@ -19,7 +19,7 @@ from ..mesh.connectivity import distinct, take_rows, used_indices
 from ..mesh.faces import Faces
 
 ADDRESSING = ("cellProcAddressing", "faceProcAddressing", "pointProcAddressing", "boundaryProcAddressing")
-"""Files of a processor for `reconstructPar`."""
+"""Files for `reconstructPar` in the folder of a processor: the cells, faces, points and patches of the whole mesh."""
 
 
 @dataclass(frozen=True)

@@ -18,10 +18,10 @@ from ..errors import InputError, MemoryLimitError
 GROUPS, OWN_GROUPS = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
 """Linux's files with the limits of control groups, and with those of this process."""
 VARIABLE = "CLVORO_MEMORY_LIMIT"
-"""Environment variable with the bytes that this process may take of each device."""
+"""Environment variable with the number of bytes that this process may allocate on each device."""
 TAKEN: Counter[cl.Device] = Counter()
 MOST_TAKEN: Counter[cl.Device] = Counter()
-"""Bytes of all arrays on each device, now and at most so far; counted if there is a limit."""
+"""Bytes of all arrays on each device: at present, and the maximum since the start. Counted only under a limit."""
 _counting = threading.RLock()
 
 

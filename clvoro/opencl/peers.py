@@ -19,11 +19,11 @@ if TYPE_CHECKING:
 Made = TypeVar("Made")
 PATIENCE, NAPS = 2, (1e-4, 2e-3)
 """A rank that waits for a message first asks for it `PATIENCE` times without a pause. Then it sleeps before each
-question, since there may be more ranks than cores: for as long as it has waited so far, within the limits `NAPS` in
+question, since there may be more ranks than cores: for as long as it has already waited, within the limits `NAPS` in
 seconds. To fall asleep and to wake up takes some 30 microseconds of processor time."""
 FEW = 32
-"""Up to so many ranks send an array to each other directly. MPI's own algorithm has several rounds, and a rank that
-sleeps delays each of them."""
+"""Largest number of ranks that send an array to each other directly. MPI's own algorithm has several rounds, and a rank
+that sleeps delays each of them."""
 ALARM, CLOSE, CLOSED = 1, 2, 3
 """Tags of messages: a rank has failed, rank 0 sends the exit code, another rank has received it."""
 GRACE = 1.0

@@ -33,7 +33,7 @@ SLACK = 1.05
 """The pool may be larger by this factor than the most that all arrays have needed together. Each time a buffer is freed
 for that, the factor grows by itself: otherwise two needs that alternate would free and allocate in every step."""
 LOOSEST, SMALL = 4, 4096
-"""A buffer may have so many times the bytes of its array, or so many bytes in any case."""
+"""Largest size of a buffer over that of its array; bytes that a buffer may have in any case."""
 KEPT = 1 << 19
 """Bytes up to which memory is kept that is not needed for a while. To allocate it again takes as long as a step of a
 small mesh."""

@@ -62,7 +62,7 @@ def check_slope(what: str, growth: object, slope: object) -> float:
 
 
 _MAX_CELLS = 1e6
-"""A proposed lower bound of h leads to at most so many cells, even if h has that value everywhere."""
+"""Largest number of cells to which a proposed lower bound of h leads, even if h has that value everywhere."""
 _LEAST_COVERED = 0.5
 """Share of the domain that the box of a field covers at least without a warning."""
 

@@ -23,7 +23,8 @@ _STATE = 8
 _FIRST_READ = 32
 """Iterations whose record is read together with the state that `solve_by_group` leaves."""
 NEARLY = 1 + 1e-6
-"""Squared residuals over their target from which on the host, which knows sums over all parts, asks the device."""
+"""Ratio of the squared residual to its target below which the host, which knows the sum over all parts, reads from the
+device whether iterations end."""
 
 
 class ConjugateGradient:

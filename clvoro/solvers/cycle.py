@@ -25,8 +25,8 @@ _EARLY = np.float32(1 / (_CENTER - _RADIUS * math.sqrt(0.5)))
 _LATE = np.float32(1 / (_CENTER + _RADIUS * math.sqrt(0.5)))
 _NO_DAMPING = np.float32(0)
 _COARSE, _COARSE_FACTOR = "cycle_by_group", 4
-"""Kernel of one work-group; where a launch does several steps, this group has so many times as many work-items as
-others, for levels of so many times as many cells."""
+"""Kernel of one work-group, which does several steps in a launch; ratio of its work-items to those of other groups, and
+of the largest levels that it does."""
 
 
 @dataclass(frozen=True)

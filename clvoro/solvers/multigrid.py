@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 _COARSEST = 64
 """Cells of the coarsest level, at most, if it is solved exactly."""
 GATHERED = 5000
-"""A level of at most so many cells, over all parts, is gathered: each part has it whole, and all do the same work."""
+"""Largest number of cells, over all parts, of a level that each part holds whole: all parts then do the same work."""
 _MAX_LEVELS = 30
 _LEAST_COARSENING = 0.8
 """Ratio of the cells of two levels above which coarsening ends."""

@@ -31,7 +31,7 @@ FORCING, ROUGHEST = 0.1, 1e-3
 FINEST = {"float64": 1e-9, "float32": 1e-5}
 """Smallest linear residual."""
 FEW = 20_000
-"""Up to so many cells all linear solves have the precision of the last ones: kernels for another one are not built."""
+"""Largest number of cells for which all linear solves have the precision of the last, to save the build of kernels."""
 
 
 @dataclass

@@ -11,9 +11,9 @@ from ..opencl.peers import Peers
 BITS = 20
 """Bits of a coordinate in the keys of the Hilbert curve."""
 BLOCKS = 1024
-"""A block has at most this fraction of the generators, 1 / `BLOCKS`, unless many are at one place."""
+"""A block has at most the share 1 / `BLOCKS` of all generators, unless many are at one place."""
 UNBALANCED = 1.1
-"""Generators are divided anew if the largest part has more than so many times the mean."""
+"""Ratio of the largest number of generators of a part to the mean beyond which parts are divided anew."""
 
 
 def hilbert_keys(points: np.ndarray, lower: np.ndarray, upper: np.ndarray, bits: int = BITS) -> np.ndarray:

@@ -36,18 +36,18 @@ from .stages import TessellationStages
 from .steps import DomainSteps, Sort
 
 FIRST_REACH = 1.9, 3.3
-"""Radius of the first balls over the spacing of the generators around. The first number holds where only own cells must
-be final (3D), the second where the cells of neighboring ghosts must be final, too (2D)."""
+"""Radius of the first balls over the spacing of the generators around: where only own cells must be final (3D), and
+where the cells of neighboring ghosts must be final, too (2D)."""
 RUN = 32
 """Number of successive generators from which their spacing is estimated."""
 JUMP = 8
-"""A new chunk begins where two successive generators are more than so many spacings apart."""
+"""Number of spacings between successive generators beyond which a new chunk begins."""
 GROWTH, SKIN = 1.4, 0.15
 """Radius of the balls of a part, over that of the balls that its cells need. Width of the skin around each ball, as a
 share of this radius: a part asks for the generators in the skin, too, because they may move into the ball."""
 NEAR, FREE = 1.2, 0.8
-"""A ball and a box of another part are compared if they are not farther apart than so many radii of the largest ball of
-both. Radius around a generator in which all others are known, over its distance from other parts."""
+"""Largest distance between a ball and a box of another part that are compared, over the largest radius of the balls of
+both. Radius around a generator within which all others are known, over its distance from other parts."""
 EXTREMES = np.minimum, np.maximum
 NOISE = {"float64": 1e-6, "float32": 1e-4}
 """Bound of the round-off of a reach, as a share of it."""
@@ -58,9 +58,9 @@ MOST_GHOSTS = 0.5
 """In 3D cells are built anew, and not updated, if there are more ghosts than this share of the own generators: too many
 cells are beside ghosts."""
 GROUP = 64
-"""Number of balls in a group, if another part has sent them."""
+"""Number of balls in each group of the balls that another part has sent."""
 FAILED = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
-"""Sums of a part whose update has failed: nothing to those of `Part.sums`, and one to the number of such parts."""
+"""Summands of a part whose update has failed: zeros for those of `Part.sums`, and 1 for the number of failed parts."""
 
 
 class Chunks:

@@ -26,7 +26,7 @@ from .polyhedra import Polyhedra
 from .stages import TessellationStages
 
 LATER_FROM = 10_000
-"""The cells of periodic images wait until the halo is known, if most cells are images and there are so many cells."""
+"""Least number of cells from which the cells of images wait until the halo is known, if most cells are images."""
 Sort: TypeAlias = Callable[[], BinnedPoints]
 """Returns the generators in bins, and sorts them when it is first called."""
 

@@ -27,7 +27,7 @@ class Action(Protocol):
 class Step:
     """Displace and move all generators, and tessellate them; then open obtuse triangles, at most `openings` times.
 
-    With `recent`, only if the number of cells has changed since so many steps.
+    With `recent`, only if the number of cells has changed in the last `recent` steps.
     """
 
     method: Method

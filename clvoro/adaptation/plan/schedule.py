@@ -98,7 +98,7 @@ from .actions import (
 from .efforts import EFFORTS_OF, Effort, choose_error_target
 
 Begins = Literal["random", "mesh", "partly random", "near"]
-"""With what a run begins; see `adaptive_schedule`."""
+"""Generators with which a run begins; see `adaptive_schedule`."""
 COUPLE = WeightedMethod(cautious=True, tolerance=0.2, max_cycles=1)
 """Weighted steps after refinement, and all in 3D: one cycle of multigrid; the next steps reduce what remains."""
 
