@@ -377,7 +377,7 @@ def _named(file: Variables, text: object) -> _Coordinates | None:
 
 
 def _places(file: Variables, coordinates: _Coordinates) -> np.ndarray:
-    """Return the places of values, (n, k), in degrees on a globe; of faces and edges they are means of corners."""
+    """Return the places of values, (n, k), in degrees on a globe; those of faces and edges are means of corners."""
     places = np.stack([file.data(name) for name in coordinates.names], axis=1)
     if coordinates.names[0] == "lonCell":
         places = np.degrees(places)

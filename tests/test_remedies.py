@@ -1020,7 +1020,7 @@ TESTED_IN = {
     "as rank 0 has; give all ranks": "adaptation/test_ranks.py::test_parts_with_other_input_are_refused",
     "one process has the whole mesh": "adaptation/test_ranks.py::test_what_the_command_refuses_over_ranks",
     "needs the whole mesh, and pieces": "adaptation/test_ranks.py::test_what_the_command_refuses_over_ranks",
-    "frames, expected one, since ranks": "adaptation/test_ranks.py::test_what_the_command_refuses_over_ranks",
+    "expected one, since ranks share it": "adaptation/test_ranks.py::test_what_the_command_refuses_over_ranks",
     "call clvoro without mpiexec": "adaptation/test_ranks.py::test_what_the_command_refuses_over_ranks",
     "mpi4py belongs to another MPI": "adaptation/test_ranks.py::test_what_the_command_refuses_over_ranks",
     "processors are given, and no mesh": "adaptation/test_ranks.py::test_what_the_command_refuses_over_ranks",

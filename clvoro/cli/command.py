@@ -278,7 +278,7 @@ def _add_foam(commands: Any) -> None:
         "--adjoints", metavar="LIST", type=_names, default=(), help="adjoint velocities of goals, among the fields"
     )
     adapt.add_argument(
-        "--viscosity", metavar="NU", type=float, help="with --adjoints: cells count by the flux of momentum, too"
+        "--viscosity", metavar="NU", type=float, help="with --adjoints: the kinematic viscosity, for momentum fluxes"
     )
     adapt.add_argument("--cycles", metavar="N", type=int, default=1, help="number of meshes (default: 1)")
     adapt.add_argument("--solver", metavar="PROGRAM", help="program that solves the case, such as simpleFoam")
@@ -395,13 +395,13 @@ def _carry_out(argv: Sequence[str] | None) -> int:
 
 @contextmanager
 def _silence() -> Iterator[None]:
-    """Discard what is printed, since rank 0 prints the same."""
+    """Discard all output of this rank, since rank 0 prints the same."""
     with open(os.devnull, "w", encoding="utf-8") as nowhere, redirect_stdout(nowhere), redirect_stderr(nowhere):
         yield
 
 
 def _explain(error: BaseException) -> tuple[object, int]:
-    """Return the message for `error` and the exit code. Raise an error again that shows a fault of clvoro."""
+    """Return the message for `error` and the exit code. Raise all errors again that are faults of clvoro itself."""
     try:
         raise error
     except (OutputError, BuildError):

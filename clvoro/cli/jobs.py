@@ -61,7 +61,7 @@ class Job:
     out : Path
         Folder for the files; created if needed.
     device : str or None
-        As `clvoro.create_context` takes it; several, with commas between them, share the run.
+        As `clvoro.create_context` takes it. Several devices, separated by commas, share the run.
     report : bool
         Whether to draw pictures and write `report.html`.
     mesh_formats : tuple of str
@@ -210,11 +210,13 @@ class Job:
                     "--pieces out"
                 )
             return
-        if self.case.frames > 1:
-            raise InputError(
-                f"{self.case.name}: the case has {self.case.frames} frames, expected one, since ranks share the run; "
-                "run it without mpiexec"
-            )
+        devices = (self.device or "").count(",") + 1
+        for number, what in ((self.case.frames, "frames"), (devices, "devices")):
+            if number > 1:
+                raise InputError(
+                    f"{self.case.name}: the run has {number} {what}, expected one, since ranks share it; run it "
+                    "without mpiexec"
+                )
         self.report = self.report and not self.pieces
         others = [kind for kind in self.mesh_formats if kind != "openfoam"]
         if self.pieces and (others or self.solver is not None):
@@ -369,11 +371,11 @@ class Job:
         return ("mesh.pvtu",) if self.pieces else ("mesh.vtu", "mesh.npz")
 
     def _mesh_file_of(self, other: str) -> str:
-        """Return the file name of the mesh of the method `other`, one before the last."""
+        """Return the file name of the mesh of the method `other`, which is not the last of the case."""
         return f"mesh-{other}{Path(self._mesh_files[-1]).suffix}"
 
     def _write(self, adapter: Any, size: Any, results: dict[str, Result], where: str) -> None:
-        """Write all files on rank 0; with `pieces` each rank writes its cells."""
+        """Write all files on rank 0. With `pieces` each rank writes its own cells."""
         if self.peers.number and not self.pieces:
             return
         *others, (_, main) = results.items()

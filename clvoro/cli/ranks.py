@@ -56,10 +56,10 @@ def this_rank() -> Peers:
 
 
 def end_together(peers: Peers, code: int, show: Callable[[], object]) -> int:
-    """Return one exit code for all ranks, after an error for which this one would end with `code`.
+    """Return the exit code of all ranks after an error. Alone, this rank would end with `code`.
 
-    Rank 0 calls `show`, which prints the message, and its code counts. A rank that does not hear from rank 0 calls
-    `show` itself and ends all processes.
+    Rank 0 calls `show`, which prints the message, and all ranks end with its code. A rank that does not hear from
+    rank 0 calls `show` itself and ends all processes.
     """
     if peers.number == 0:
         show()

@@ -22,7 +22,7 @@ RIGHT_ANGLE = 90 + 1e-4
 
 @dataclass(frozen=True, repr=False)
 class CGridMeasures:
-    """Measures for C grids: one per cell (n,), per half-face (m,), or per corner of a cell, if not on a wall (k,)."""
+    """Measures for C grids per cell (n,), per half-face (m,), or per corner of a cell that is not on a wall (k,)."""
 
     angles: np.ndarray
     """(k,) float. Angles of the Delaunay triangles in degrees, each once: the one opposite to the side that belongs to

@@ -41,10 +41,9 @@ class MeshInFile:
     corners: np.ndarray
     """(m,) int. Corners of the cells, one cell after the other, counter-clockwise."""
     middles: np.ndarray | None = None
-    """(m, 3) float64, optional. For the face from each corner to the next the middle of the arc between its
-    generators."""
+    """(m, 3) float64, optional. Middle of the arc between both generators of the face from each corner to the next."""
     of_run: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
-    """three (n,) float64, optional. Size, error and quality."""
+    """Size, error and quality of the cells, each (n,) float64; None if the file is not of a run."""
 
 
 def make_diagram(cells: MeshInFile) -> Diagram:

@@ -36,7 +36,7 @@ class LonLatArea:
     [-180, 180] and beyond."""
     piece_of_outer: np.ndarray
     piece_of_hole: np.ndarray
-    """`piece_of_outer`, `piece_of_hole`: (k,) int. Polygon that each of them belongs to."""
+    """`piece_of_outer`, `piece_of_hole`: (k,) int. Number of the polygon of each ring."""
 
     def contains(self, lonlat: np.ndarray) -> np.ndarray:
         """Return whether each position (n, 2), longitudes in [-180, 180], is in a polygon or on its edge; (n,) bool."""

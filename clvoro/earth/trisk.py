@@ -29,7 +29,7 @@ class Weights:
     """(w,) int. The other edges, counter-clockwise from the edge on: those of the lower cell, then those of the other
     cell."""
     values: np.ndarray
-    """(w,) float."""
+    """(w,) float. The weight of each of these edges."""
 
 
 def find_weights(halves: HalfEdges, shares: np.ndarray, lengths: np.ndarray, distances: np.ndarray) -> Weights:

@@ -46,13 +46,13 @@ class Coloring:
     """A quantity that colors cells."""
 
     label: str
-    """With its unit, for the color bar."""
+    """Text beside the color bar, with the unit."""
     values: Callable[[Result], np.ndarray]
-    """One number per cell."""
+    """Function that returns one number per cell."""
     color_map: Any
-    """Perceptually uniform; diverging around zero for a signed quantity."""
+    """Color map or its name: perceptually uniform, and diverging around zero for a signed quantity."""
     limits: Callable[[np.ndarray], tuple[float, float]]
-    """The two ends of the scale."""
+    """Function of the values that returns the lower and the upper end of the scale."""
     logarithmic: bool = False
     classes: tuple[str, ...] = ()
     """Names of integer values, from the lower limit on; empty for a continuous quantity."""

@@ -107,7 +107,7 @@ def _length(axis: Any) -> tuple[float, bool]:
 
 
 class _RoundSteps(MaxNLocator):
-    """Round numbers, as many as the bar has room for; with `integers` no others, as for regions and counts."""
+    """Round numbers, as many as the bar has room for. With `integers` all are whole, as regions and counts are."""
 
     def __init__(self, integers: bool) -> None:
         super().__init__(steps=[1, 2, 5, 10], integer=integers)

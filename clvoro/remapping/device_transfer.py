@@ -49,7 +49,7 @@ class PieceArrays:
 
     pieces: Pieces
     args: tuple[cla.Array, ...]
-    """PIECES_ARGS of `transfer.cl`."""
+    """The arguments `PIECES_ARGS` of kernels in `transfer.cl`."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ class PieceMeasures:
 
     volumes: np.ndarray
     centroids: np.ndarray
-    """`volumes`, `centroids`: (k,), (k, d) float64. On a sphere centroids are means of the position, inside of it."""
+    """`volumes`, `centroids`: (k,), (k, d) float64. On a sphere centroids are means of positions, inside the sphere."""
     lower: np.ndarray
     upper: np.ndarray
     """`lower`, `upper`: (k, d) float64. Corners of a box around each piece."""
@@ -78,7 +78,7 @@ class CellData:
     means: cla.Array
     """(n, d) real. Centroids; on a sphere means of the position."""
     slopes: cla.Array | None = None
-    """(n, width, d) real or None."""
+    """(n, width, d) real. Slopes of the data in each cell; None for constants."""
 
     @property
     def kernel_args(self) -> tuple[object, ...]:
@@ -104,7 +104,7 @@ class CellGraph:
     neighbors: np.ndarray
     """`starts`, `neighbors`: (n + 1,), (m,) int. Negative neighbors are walls."""
     shifts: np.ndarray
-    """(m, d) int8. The neighbor is the image that many periods away."""
+    """(m, d) int8. Number of periods along each axis to the image that is the neighbor."""
     periods: np.ndarray
     """(d,) float64. In the coordinates of the `Space`."""
 

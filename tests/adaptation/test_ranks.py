@@ -454,8 +454,9 @@ def test_what_the_command_refuses_over_ranks(tmp_path, monkeypatch):
     with pytest.raises(InputError, match="processors are given, and no mesh"):
         Job(case, tmp_path, processors=2)._refuse_formats()
     Job(case, tmp_path, processors=2, mesh_formats=("openfoam",))._refuse_formats()
-    with pytest.raises(InputError, match="has 32 frames, expected one"):
-        Job(load_case("spots"), tmp_path, peers=ranks)._refuse_pieces()
+    for changed, what in ((load_case("spots"), None), "32 frames"), ((case, "0:0,0:1"), "2 devices"):
+        with pytest.raises(InputError, match=f"has {what}, expected one"):
+            Job(changed[0], tmp_path, changed[1], peers=ranks)._refuse_pieces()
 
     monkeypatch.setenv("PMI_SIZE", "2")
     mpi4py = types.ModuleType("mpi4py")
