@@ -116,7 +116,7 @@ def make_adapter(options: argparse.Namespace) -> clvoro.Adapter:
 
 
 def run_ranks(ranks: int, script: Sequence[str], **settings: Any) -> subprocess.CompletedProcess[str]:
-    """Run a `script` (file, arguments) under `mpiexec`, with a core for each rank; see `subprocess.run`."""
+    """Run a `script` (file, arguments) under `mpiexec`, a core for each rank, with `settings` of `subprocess.run`."""
     mpiexec = shutil.which("mpiexec", path=Path(sys.executable).parent) or "mpiexec"
     command = [mpiexec, "-n", str(ranks), sys.executable, "-W", "ignore", *script]
     environment = {**os.environ, "POCL_MAX_PTHREAD_COUNT": "1"}

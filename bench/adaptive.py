@@ -22,10 +22,10 @@ error of the uniform mesh over it, and "predicted" the error that the last sizes
 
 Three more columns say how much of this is due to sizes and how much to shapes. "sizes" is the error over the optimum if
 all simplices were regular, with the volumes of the mesh's cells, at random places in them. L1 and L2, divided by
-"sizes", are the factors due to shapes. "bound" is the least of all "sizes", whatever their growth: the optimum holds
-for many cells, and fewer are larger than the layer. A mesh whose cells are placed with regard to the function can be
-better. With `--exact` the sizes come from the function's own second derivatives,
-averaged over a ball of the size of a cell: the difference is what the estimate costs.
+"sizes", are the factors due to shapes. "bound" is the least value of "sizes" for this number of cells, with any
+growth of sizes. It is above 1 where cells are larger than the layer, since the optimum holds for many cells. A mesh
+whose cells are not at random places can be better. With `--exact` the sizes come from the function's own second
+derivatives, averaged over a ball of the size of a cell: the difference is what the estimate costs.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ BATCH = 4_000_000
 SAMPLES = 1 << 16
 ROUNDS = 24
 PLACES, TRIES, TOGETHER = 4000, 6, 50
-"""Places at which the best sizes are sought, simplices at each of them, and places with one size."""
+"""Number of places at which the best sizes are sought, of simplices at each, and of successive places with one size."""
 PER_CELL = {2: 2, 3: 6}
 """Simplices for each point of a hexagonal or a body-centered lattice."""
 BALL = {2: math.pi**-0.5, 3: (0.75 / math.pi) ** (1 / 3)}

@@ -5,9 +5,9 @@
 
 `CLVORO_MEMORY_LIMIT` lets a process take a share of the memory that one device needs for the run. In one part the run
 is refused before it begins. Over ranks, each a process with the same limit, it is done, and its pieces are written.
-`needed` is the estimate for a part, and `taken` what the rank with the most has taken, in MiB as the limit. Parts have
-ghosts besides their own cells, and up to a tenth more cells than the mean: a share of the memory takes more than its
-inverse in parts. Needs `pip install -e '.[mpi]'`.
+`needed` is the estimate for one part, and `taken` the most that a rank has allocated; both and the limit are in MiB.
+Parts have ghosts besides their own cells, and up to a tenth more cells than the mean, so that a share of 0.2 needs more
+than 5 parts. Needs `pip install -e '.[mpi]'`.
 """
 
 from __future__ import annotations

@@ -8,8 +8,9 @@ a smooth random field; "checkers", patches of a checkerboard; "shores", blobs th
 pixels along it; or "noise", each pixel with a probability of 1 : 4. Digitized outlines are rough shores of about 60
 pixels: "coasts" with needles, slits and spikes of a width from 1e-10 to 1e-2 and islands that touch in a point,
 "charts" with vertices twice or nearly so, rings that nearly touch, and edges that run there and back; those that cross
-themselves are repaired. "rivers" are masks, too; "buildings" and "archipelagos" leave space between bodies that touch,
-"contours" are parts of a smooth field. All cells have the same size, in pixels.
+themselves are repaired. "rivers" are masks, too. "buildings" and "archipelagos" are the space between bodies, some
+of which touch. "contours" are the largest part of a smooth field between two levels. All cells have the same size, in
+pixels.
 
 Rows have means over the outlines, of the domain as given or `simplified` by 1.5 sizes, and what becomes of the meshes:
 accepted by `checkMesh -allGeometry -allTopology` (without OpenFOAM by its criteria), refused by a message before the

@@ -7,8 +7,8 @@ For each number of ranks the script starts itself under `mpiexec`; with PoCL eac
 the diagram of random points has the same bits as with the first number of ranks. The other columns are of a run in a
 box with sizes from h to 3 h, after a run of fewer cells, which builds kernels. `CPU s` is its processor time, summed
 over ranks, and `over one` the ratio to that of the first number of ranks. `floor` is the same ratio for as many
-processes that each make their share of the cells alone, at the same time and without messages: what fixed work per
-step, and cores and caches that processes share, cost anyway. `exchanges` and `reductions` are the rounds of messages
+processes at the same time that each make a mesh of n / p cells without messages: it has the cost of the fixed work of a
+step, and of shared cores and caches. `exchanges` and `reductions` are the rounds of messages
 between pairs of ranks, and of sums over all ranks, per step. Some of both take place at the same time; `waits` counts
 how often a rank waits for others. `ghosts` is the number of ghosts of rank 0 in
 the last diagram over 2 d (n / p)^((d - 1) / d), an estimate of one layer of cells around a part. `one round` is the
