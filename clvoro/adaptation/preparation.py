@@ -431,8 +431,9 @@ def without_far(prepared: Prepared, max_levels: int | None = None) -> Prepared:
     """
     given, setup, options = prepared.points, prepared.setup, prepared.options
     assert given is not None
+    assert prepared.tree is not None
     n, real = _cells_at_start(prepared), setup.stages.engine.real
-    points, rows = replace_far(given, setup.sizing, setup.free, n, options.seed, real, prepared.tree)
+    points, rows = replace_far(given, prepared.tree, setup.free, n, options.seed, real)
     if len(rows) == len(given):
         return prepared
     before = np.arange(len(given)) if prepared.kept_rows is None else prepared.kept_rows

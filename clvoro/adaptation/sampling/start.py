@@ -31,11 +31,6 @@ class Charted:
     def __init__(self, field: Callable[[np.ndarray], np.ndarray], domain: Domain) -> None:
         self._field, self._domain, self._chart = field, domain, domain.chart()
 
-    @property
-    def real(self) -> np.dtype:
-        """Precision of the field."""
-        return getattr(self._field, "real", np.dtype(float))
-
     def __call__(self, points: np.ndarray) -> np.ndarray:
         """Return h at places in the chart, (n,)."""
         return self._field(self._chart.position(points))
@@ -128,28 +123,27 @@ def sample_density(
     (n, d) float64
         Physical coordinates, distinct and strictly inside, in the order of the curve.
     """
-    return replace_far(np.empty((0, domain.dim)), field, domain, n, seed, real, tree)[0]
+    n, seed = _check_arguments(n, seed)
+    field = _evaluator(field)
+    precision = getattr(field, "real", np.float64) if real is None else real
+    tree = density_tree(field, domain) if tree is None else tree
+    return replace_far(np.empty((0, domain.dim)), tree, domain, n, seed, precision)[0]
 
 
 def replace_far(
-    points: np.ndarray,
-    field: Callable[[np.ndarray], np.ndarray] | float,
-    domain: Domain,
-    n: int,
-    seed: int,
-    real: DTypeLike | None = None,
-    tree: DensityTree | None = None,
+    points: np.ndarray, tree: DensityTree, domain: Domain, n: int, seed: int, real: DTypeLike
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return `points`, replaced by those of `sample_density` where their number is far from that of the density.
+    """Replace `points` by those of `sample_density` where their number is far from that of the density.
 
-    The boxes of `sample_density` are divided along the curve into stretches of `STRETCH` points, given and expected
-    ones. Where one number is more than ``FAR**d`` times the other, the expected points replace the given ones.
+    The boxes of `sample_density` are divided along the curve into stretches. In each stretch given and expected points
+    together are `STRETCH`. Where there are more than ``FAR**d`` times as many of one kind as of the other, the expected
+    points replace the given ones.
 
     Parameters
     ----------
     points : (k, d) float64
         Inside the domain.
-    field, domain, n, seed, real, tree
+    tree, domain, n, seed, real
         As for `sample_density`.
 
     Returns
@@ -158,20 +152,11 @@ def replace_far(
         Those of `points` that are kept, then new ones. Without points, or if none is kept, these are the `n` points of
         `sample_density`.
     (l,) int
-        Rows of the kept ones in `points`.
-
-    Raises
-    ------
-    SizeFieldError, InputError
-        As for `sample_density`.
+        Rows in `points` of those that are kept.
     """
-    n, seed = _check_arguments(n, seed)
-    field = _evaluator(field)
-    tree = density_tree(field, domain) if tree is None else tree
     chart = domain.chart()
     if chart.domain is not domain:
-        _, field = charted(domain, field)
-        found, rows = replace_far(chart.place(points), field, chart.domain, n, seed, real, tree)
+        found, rows = replace_far(chart.place(points), tree, chart.domain, n, seed, real)
         return np.concatenate([points[rows], chart.position(found[len(rows) :])]), rows
     boxes, coverage, slopes = tree.boxes, tree.coverage, tree.slopes
     share = tree.cells * (n / tree.integral)
@@ -191,17 +176,13 @@ def replace_far(
         slope = slopes[mine] * coverage.relative_edges(mine)
         return coverage.draw(_log_linear(rng.random((len(wanted), domain.dim)), slope), mine, attempt)
 
-    precision = getattr(field, "real", np.float64) if real is None else real
-    return _in_all_pieces(domain, _distinct(draw, domain, len(box), np.dtype(precision), points[rows])), rows
+    return _in_all_pieces(domain, _distinct(draw, domain, points[rows], len(box), np.dtype(real))), rows
 
 
 def _are_far(expected: np.ndarray, given: np.ndarray, dim: int) -> np.ndarray:
-    """Return for each box whether the number of points in its stretch of the curve is far from the expected one.
+    """Return for each box, (m,) bool, whether the number of points in its stretch is far from the expected one.
 
-    Parameters
-    ----------
-    expected, given : (m,) float
-        Number of points in each box, in the order of the curve.
+    `expected` and `given` (m,) are numbers of points in each box, in the order of the curve.
     """
     both = expected + given
     stretch = ((np.cumsum(both) - both) / STRETCH).astype(int)
@@ -238,7 +219,7 @@ def sample_uniform(domain: Domain, n: int, seed: int, real: DTypeLike = np.float
         del attempt
         return place(len(rows))
 
-    return _in_all_pieces(domain, _distinct(draw, domain, n, np.dtype(real)))
+    return _in_all_pieces(domain, _distinct(draw, domain, np.empty((0, domain.dim)), n, np.dtype(real)))
 
 
 @runtime_checkable
@@ -306,20 +287,14 @@ def _log_linear(u: np.ndarray, slope: np.ndarray) -> np.ndarray:
 
 
 def _distinct(
-    draw: Callable[[np.ndarray, int], np.ndarray],
-    domain: Domain,
-    n: int,
-    real: np.dtype,
-    kept: np.ndarray | None = None,
+    draw: Callable[[np.ndarray, int], np.ndarray], domain: Domain, kept: np.ndarray, n: int, real: np.dtype
 ) -> np.ndarray:
-    """Return the points `kept` and `n` others. Where some coincide or are on a wall in precision `real`, draw again.
+    """Return the points `kept`, then `n` drawn ones, which are drawn again if they are not distinct or on a wall.
 
-    `draw(wanted, attempt)` returns new points for the rows `wanted` among the n.
+    Points are compared in precision `real`. ``draw(wanted, attempt)`` returns points for the rows `wanted` of the n.
     """
-    origin, scale = domain.frame
-    first = 0 if kept is None else len(kept)
-    points = np.empty((first + n, domain.dim))
-    points[:first] = kept if first else 0
+    (origin, scale), first = domain.frame, len(kept)
+    points = np.concatenate([kept, np.empty((n, domain.dim))])
     rows, bad = np.arange(first, first + n), np.zeros(first + n, bool)
     for attempt in range(_ATTEMPTS):
         points[rows] = draw(rows - first, attempt)

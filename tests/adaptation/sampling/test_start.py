@@ -314,4 +314,4 @@ def test_draws_reach_a_point_just_below_the_surface_of_a_solid():
     def draw(rows, attempt):
         return inner[rows] + 0.5 ** max(0, attempt - 20) * np.array([0.1, 0.2, 0.2])
 
-    assert cube.contains(_distinct(draw, cube, 1, np.dtype(float))).all()
+    assert cube.contains(_distinct(draw, cube, np.empty((0, 3)), 1, np.dtype(float))).all()
