@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from os import PathLike
-from typing import TYPE_CHECKING, Any, Literal, NoReturn
+from typing import TYPE_CHECKING, Literal, NoReturn
 
 import numpy as np
 import pyopencl as cl
@@ -19,13 +19,12 @@ from .adaptation.options import (
     EffortName,
     MethodName,
     MultilevelOptions,
-    Options,
     PaperOptions,
     Start,
     merged_options,
 )
 from .adaptation.preparation import prepare
-from .adaptation.run import INTERRUPTED, Run, check_run, check_shared
+from .adaptation.run import INTERRUPTED, Run, RunArguments, check_run, check_shared
 from .adaptation.stages import Stages
 from .adaptation.transport import RELAXED, power_diagram_of, transport_to
 from .arguments import check_choice, check_integer, check_points, coincident_named
@@ -533,34 +532,26 @@ class Adapter:
         check_choice("on_interrupt", on_interrupt, ("raise", "return"))
         check_run(domain, size, callback)
         with self._alone():
-            given = domain, size, own, fixed, merged, checkpoint
             run = self._run_together if self._others else self._run
-            return run(*given, callback=callback, on_interrupt=on_interrupt)
+            return run(RunArguments(domain, size, own, fixed, merged, checkpoint), callback, on_interrupt)
 
     def _run(
         self,
-        domain: Domain,
-        size: object,
-        points: ArrayLike | None,
-        fixed: ArrayLike | None,
-        options: Options,
-        checkpoint: str | PathLike[str] | Checkpoint | None,
-        *,
+        arguments: RunArguments,
         callback: Callable[[np.void], object] | None,
         on_interrupt: Literal["raise", "return"],
     ) -> Result:
-        """Do what `run` does, with arguments that are checked, on this device."""
+        """Do what `run` does on this device."""
         for kept in self._stages.values():
             kept.release()  # buffers of a diagram, or of a failed run, are not part of this run's memory
-        stages = self._stages_for(domain, self._peers)
+        stages = self._stages_for(arguments.domain, self._peers)
         if self._peers.shared:
-            check_shared(domain, options, fixed)
+            check_shared(arguments.domain, arguments.options, arguments.fixed)
         with report_builds(stages.engine, self.on_build) as notice:
             shown = self._shown(callback, notice)
             stages.engine.pool.on_work = self.on_work
             try:
-                run = Run(stages, domain, size, points, fixed, options, checkpoint, shown, self.on_memory)
-                return run.conclude(on_interrupt)
+                return Run(stages, arguments, shown, self.on_memory).conclude(on_interrupt)
             except BaseException as error:
                 self._peers.fail(error)
                 raise
@@ -568,7 +559,10 @@ class Adapter:
                 stages.engine.pool.on_work = None
 
     def _run_together(
-        self, *given: Any, callback: Callable[[np.void], object] | None, on_interrupt: Literal["raise", "return"]
+        self,
+        arguments: RunArguments,
+        callback: Callable[[np.void], object] | None,
+        on_interrupt: Literal["raise", "return"],
     ) -> Result:
         """Do the same on all devices, and return the whole mesh."""
         for other in self._others:
@@ -581,7 +575,7 @@ class Adapter:
                 return peers.team.interrupted
 
             adapter = (self, *self._others)[peers.number]
-            return adapter._run(*given, callback=answer, on_interrupt=on_interrupt).gather()
+            return adapter._run(arguments, answer, on_interrupt).gather()
 
         result = self._team.run(work)[0]
         assert result is not None
@@ -646,7 +640,8 @@ class Adapter:
         stages = Stages(self._engine_for(domain))
         with self._at_work(stages):
             shown = self._shown(None, None)
-            return Run(stages, domain, size, own, fixed, merged, checkpoint, shown, self.on_memory, self._at_work)
+            arguments = RunArguments(domain, size, own, fixed, merged, checkpoint)
+            return Run(stages, arguments, shown, self.on_memory, self._at_work)
 
     @contextmanager
     def _at_work(self, stages: Stages) -> Iterator[None]:

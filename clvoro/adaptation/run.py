@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from os import PathLike
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -84,6 +84,17 @@ def check_shared(domain: Domain, options: Options, fixed: object) -> None:
         raise InputError(f"{what}, since ranks or devices share the run; use an Adapter without comm and devices")
 
 
+class RunArguments(NamedTuple):
+    """Arguments of `Adapter.run`; those of options are merged and checked, the others as the caller gives them."""
+
+    domain: Domain
+    size: object
+    points: ArrayLike | None
+    fixed: ArrayLike | None
+    options: Options
+    checkpoint: str | PathLike[str] | Checkpoint | None
+
+
 class Run:
     """A run that goes on step by step, shows its mesh at any time, and follows other size fields.
 
@@ -114,16 +125,12 @@ class Run:
     def __init__(
         self,
         stages: Stages,
-        domain: Domain,
-        size: object,
-        points: ArrayLike | None,
-        fixed: ArrayLike | None,
-        options: Options,
-        checkpoint: str | PathLike[str] | Checkpoint | None,
+        arguments: RunArguments,
         callback: Callable[[np.void], object] | None = None,
         on_memory: Callable[[float], object] | None = None,
         alone: Callable[[Stages], AbstractContextManager[object]] = nullcontext,
     ) -> None:
+        domain, size, points, fixed, options, checkpoint = arguments
         files = checkpoint if isinstance(checkpoint, Checkpoint) else Checkpoint(checkpoint)
         given = None if points is None else check_points(points, domain)
         self._stages, self._domain, self._options = stages, domain, options
