@@ -203,7 +203,7 @@ def follow(
 
 
 def divergence_of(folder: Path, times: list[float]) -> float:
-    """Return the largest sum of fluxes over the faces of a cell at some times, over the largest flux."""
+    """Return the largest sum of the fluxes of a cell at some times, divided by the largest flux."""
     case, worst = FoamCase(folder), 0.0
     for at in (one for one in case.times() if one.value in times):
         mesh = Mesh.of(folder, case.mesh_folder(at))

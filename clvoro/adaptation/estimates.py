@@ -25,7 +25,7 @@ MAX_CELLS = 100_000_000
 MAX_LABELS = 2_000_000_000
 """Limit of the permanent numbers of generators, which are unique among all parts."""
 GHOST_LAYERS = {2: 2.8, 3: 2.2}
-"""Depth of the layer of ghosts around a part over the size of cells; see `clvoro.tessellation.part_steps`."""
+"""Depth of the layer of ghosts around a part, divided by the size of cells; see `clvoro.tessellation.part_steps`."""
 SIZES = {
     "plane": {"run": (26, 86), "diagram": (65, 45), "power run": (74, 119), "power diagram": (75, 92)},
     "cut": {"run": (68, 79), "diagram": (94, 90), "power run": (171, 134), "power diagram": (125, 130)},

@@ -22,7 +22,7 @@ from ..mesh.read_only import read_only
 from .tuning import AT_WALL, BEHIND_WALL, CANDIDATES, CLEARINGS, CLOSE, ON_WALL
 
 _ROUND_OFF = 1e-5
-"""Largest distance of fixed generators from their positions by round-off in single precision, over the extent."""
+"""Largest distance by which round-off in single precision moves a fixed generator, divided by the domain's extent."""
 
 
 def check_fixed(fixed: object, domain: Domain, real: np.dtype) -> np.ndarray:
@@ -292,7 +292,7 @@ def clear_balls(
 
 
 def put_back(diagram: Diagram, fixed: np.ndarray) -> None:
-    """Give the first generators of `diagram` the positions `fixed` (k, d) without round-off, but not moved ones."""
+    """Give the first generators of `diagram` their exact positions `fixed` (k, d), except those that were moved."""
     if len(fixed):
         points = diagram.points.copy()
         near = np.abs(points[: len(fixed)] - fixed).max(axis=1) < _ROUND_OFF * diagram.domain.extent.max()

@@ -154,7 +154,7 @@ class ProjectedMethod(Method):
     relaxation: float = 1.0
     """Factor on the descent."""
     momentum: float = 0.7
-    """Share of the last displacement that is added."""
+    """Share of the previous displacement that is added to the present one."""
     penalty: float = 0.1
     """Penalty eps of the projection: the smaller, the more accurate the sizes."""
     quality_scale: float = 0.0

@@ -53,28 +53,28 @@ class Prepared:
     options: Options
     setup: Setup
     points: np.ndarray | None
-    """(n, d) ndarray or None. Generators of the caller, or some of them and new ones (`without_far`)."""
+    """(n, d) ndarray or None. Points of the caller, or some of them, then new ones (`without_far`)."""
     rows: np.ndarray
     """(m, d) ndarray. Generators of layers, which do not move."""
     tree: DensityTree | None
-    """Where the cells are; None if the generators of the caller keep their number."""
+    """Number of cells in each part of the domain; None if the method keeps the number of given points."""
     required: float
-    """Cells that the size field requires, or that the caller gives."""
+    """Number of cells that the size field requires, or of given points if the method keeps it."""
     target: int
-    """Cells of the finest level."""
+    """Number of cells of the finest level."""
     lattice: np.ndarray | None
     """(n, d) ndarray or None. Generators at the start of a moving mesh."""
     levels: int
     """Number of coarser levels."""
     kept_rows: np.ndarray | None
-    """(n,) int or None. Indices of `points` among those that the caller has given, if not all are kept; -1 for new
-    ones."""
+    """(n,) int or None. For each of `points` its index in those of the caller, or -1; None if all are those of the
+    caller."""
     memory: float
     """Estimated device memory of the run, or of reading its diagram, in bytes."""
 
     @property
     def origins(self) -> np.ndarray | None:
-        """For each generator at the start its index in the points of the caller, or -1; None if there are none."""
+        """For each generator at the start its index in the points of the caller, or -1; None without `points`."""
         if self.points is None:
             return None
         own = np.arange(len(self.points)) if self.kept_rows is None else self.kept_rows
@@ -425,9 +425,9 @@ def _cells_at_start(prepared: Prepared) -> int:
 
 
 def without_far(prepared: Prepared, max_levels: int | None = None) -> Prepared:
-    """Return the same run with new points in place of those of the caller that are far from the sizes.
+    """Return the same run with random points in place of those of the caller that are far from the sizes.
 
-    If all are, the run begins as if there were none.
+    If all points are far, the run begins as one without points.
     """
     given, setup, options = prepared.points, prepared.setup, prepared.options
     assert given is not None

@@ -100,9 +100,9 @@ class Setup:
     fixed: int
     """Generators with labels below `fixed` do not move."""
     points: np.ndarray
-    """(k, d) ndarray. Positions of those with the labels 0 to k - 1, on the finest level: first those of the caller,
-    then those around corners and creases, then those beside lines. The other fixed generators are those of layers.
-    Cells beside lines, in layers, and around crowded creases keep their size, which is their target size."""
+    """(k, d) ndarray. Positions of the generators with the labels 0 to k - 1, on the finest level: first those of the
+    caller, then those around corners and creases, then those beside lines. The other fixed generators are those of
+    layers. Cells beside lines, in layers, and around crowded creases keep their size, which is their target size."""
     factor: float = 1.0
     """Initial factor on the size field on the finest level."""
     own_factor: float = 1.0
@@ -114,7 +114,7 @@ class Setup:
 
     @property
     def first_sized(self) -> int:
-        """Label of the first generator whose cell keeps its size, as its target size."""
+        """Label of the first generator whose cell keeps its size: that is its target size."""
         return len(self.points) - (0 if self.around is None else self.around.n_sized)
 
     @property

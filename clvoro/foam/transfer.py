@@ -104,7 +104,7 @@ def entries_at(field: FoamField, patch: FoamPatchFaces) -> Entries:
     InputError
         If there are none.
     """
-    # Walls are in the group "wall", and so are other types in theirs.
+    # A patch is also in the group of its type, such as "wall".
     for name in (patch.name, *patch.groups, patch.kind):
         if name in field.patches:
             return field.patches[name]

@@ -164,7 +164,7 @@ def decompose(mesh: Faces, patches: list[FoamPatch], part: np.ndarray) -> Iterat
         for k, patch in enumerate(patches):
             lists.append(begins[k] + np.flatnonzero((own & same)[begins[k] : ends[k]]))
             made.append(replace(patch, size=len(lists[-1])))
-        # A seam has each face twice, and a processor takes the one that it owns. Other faces are there once for both.
+        # At seams each processor has a face of its own. Elsewhere two processors share one face.
         shared = np.flatnonzero(~same & (own | ((there == p) & (of_patch < 0))))
         other = np.where(own[shared], there[shared], here[shared])
         for q in distinct(other):

@@ -76,7 +76,7 @@ class StepOfMesh(Step):
 
 @dataclass(frozen=True)
 class CountOfMesh:
-    """Insert and delete generators, so that their number is that for the cells of the resulting mesh; see `StepOfMesh`.
+    """Correct the number of generators for the cells of the resulting mesh; see `StepOfMesh`.
 
     With a fixed number of cells nothing is done.
     """

@@ -13,10 +13,10 @@ from .actions import RepairCells
 
 @dataclass(frozen=True)
 class LoosePolish:
-    """Polishing with a large error target: the penalty has to grow, and shape relaxes over many cells."""
+    """The last steps if the error target is large: more of them, since the penalty has to grow to meet the target."""
 
     above: float
-    """Error target above which it is used."""
+    """Error target above which these steps are taken."""
     steps: int
     momentum: float
 

@@ -24,8 +24,10 @@ In 3D there is no lattice with dislocations. Each level glides, then polishes:
 
 *correct count ahead*  to the number from which refinement gives that of the next level, where it seldom has to change
 
-Given points that are far from the sizes are replaced by those of a density start, and the finest level begins with
-them. From a mesh that is close to its size field, for instance after the field has moved by a few cells:
+Where the number of given points is far from that of the sizes, points of a density start replace them, and the run
+begins on the finest level.
+
+From a mesh that is close to its size field, for instance after the field has moved by a few cells:
 
     stride ─► correct count ─► stride ─► correct ─► correct count ─► polish (─► project)
 
@@ -98,7 +100,7 @@ from .actions import (
 from .efforts import EFFORTS_OF, Effort, choose_error_target
 
 Begins = Literal["random", "mesh", "partly random", "near"]
-"""Generators with which a run begins; see `adaptive_schedule`."""
+"""What a run begins with: random points, a mesh, a mesh with some random points, or a mesh that is near its sizes."""
 COUPLE = WeightedMethod(cautious=True, tolerance=0.2, max_cycles=1)
 """Weighted steps after refinement, and all in 3D: one cycle of multigrid; the next steps reduce what remains."""
 
@@ -135,8 +137,8 @@ def adaptive_schedule(
     error_target : float, optional
         By default that of `choose_error_target` for smooth sizes.
     begins : "random", "mesh", "partly random" or "near"
-        The start is a random sample, a mesh, one with random points in place of some, or one that only needs a
-        correction (see `is_near`). In the last case there are no coarser levels.
+        What the run begins with: random points, a mesh, a mesh in which random points replace some, or a mesh that only
+        needs a correction (see `is_near`), without coarser levels.
     openings : int
         How often the last steps open obtuse triangles, at most. Some steps before them cells of four sides are deleted,
         and those of eight split: a cell of four sides has an obtuse triangle.
@@ -145,8 +147,8 @@ def adaptive_schedule(
         each refinement, which multiplies what a part lacks, before polishing, and after each repair. The penalty of
         exact projections falls step by step (see `GRADUAL_PENALTIES`).
     most : int, optional
-        Number of steps for which sweeps, and in 3D steps of the first polishing, are left out, from a mesh and without
-        coarser levels. The last steps, which polish, are not.
+        Largest number of steps from a mesh without coarser levels. Sweeps, and in 3D steps of the first polishing, are
+        left out to meet it. The last steps, which polish, are kept, even if they are more.
     """
     if error_target is None:
         error_target = choose_error_target(dim, effort, levels, begins == "near")
