@@ -99,11 +99,9 @@ def _add_settings(run: Any) -> None:
     run.add_argument(
         "--device",
         metavar="NAME",
-        help="gpu, cpu, part of a name, or PLATFORM:DEVICE indices; several, as 0:0,0:1, share the run",
+        help="gpu, cpu, part of a name, or PLATFORM:DEVICE indices; several devices, such as 0:0,0:1, share the run",
     )
-    run.add_argument(
-        "--share-gpus", action="store_true", help="let several ranks use one GPU, or the run one device several times"
-    )
+    run.add_argument("--share-gpus", action="store_true", help="let several ranks, or parts of a run, use one device")
     run.add_argument(
         "--method",
         metavar="M",
