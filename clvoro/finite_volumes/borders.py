@@ -12,13 +12,12 @@ import numpy as np
 from ..errors import InputError
 from ..geometry.solid.creases import connect
 from ..geometry.surfaces.sheets import Sheets
-from ..mesh.connectivity import distinct, following, take_rows
+from ..mesh.connectivity import distinct, following, rows_with, take_rows
 from ..mesh.diagram import Diagram
 from ..mesh.faces import Faces
 from .collapse import collapse_short
-from .gate import rejected_cells
 from .moves import fewest_rejected, moved
-from .solid_walls.mend import NARROW, cells_of, narrow_faces, with_neighbors
+from .solid_walls.mend import NARROW, cells_of, narrow_faces, rejected_among, with_neighbors
 from .solid_walls.mesh import diagram_of
 
 _SMALL = 0.15
@@ -124,7 +123,7 @@ def _made(diagram: Diagram, sheets: Sheets) -> _OnSurfaces:
             break
         made = _moved(collapse_short(made.faces, None, narrow, narrow), sheets, h)
     # Then single faces are collapsed where fewer cells are rejected afterwards.
-    rejected, tried = _rejected(made), 0
+    rejected, tried = _rejected(made, np.ones(len(made), bool)), 0
     while len(rejected) and tried < _TRIALS:
         mesh = made.faces
         of_rejected = np.isin(mesh.owner, rejected) | np.isin(mesh.neighbor, rejected)
@@ -133,8 +132,8 @@ def _made(diagram: Diagram, sheets: Sheets) -> _OnSurfaces:
         narrow = narrow[np.argsort((mesh.area / size)[narrow], kind="stable")][tried:]
         if not len(narrow):
             break
-        trial = _moved(_without_face(mesh, narrow[0]), sheets, h)
-        left = _rejected(trial)
+        trial, near = _moved(_without_face(mesh, narrow[0]), sheets, h), _around(mesh, narrow[0])
+        left = np.union1d(rejected[~near[rejected]], _rejected(trial, near))
         if len(left) < len(rejected):
             made, rejected, tried = trial, left, 0
         else:
@@ -143,11 +142,16 @@ def _made(diagram: Diagram, sheets: Sheets) -> _OnSurfaces:
     return _OnSurfaces(made, rejected)
 
 
-def _rejected(diagram: Diagram) -> np.ndarray:
-    """Return the cells that OpenFOAM rejects among those with a face on a surface and their neighbors, (k,) int."""
-    mesh, beside = diagram.faces, _beside(diagram)
-    divided = beside[mesh.owner] | (beside[np.maximum(mesh.neighbor, 0)] & (mesh.neighbor >= 0))
-    return np.flatnonzero(rejected_cells(mesh, np.flatnonzero(divided), beside))
+def _rejected(diagram: Diagram, among: np.ndarray) -> np.ndarray:
+    """Return which of the cells `among` (n,) bool, with a face on a surface or beside such a cell, OpenFOAM rejects."""
+    beside = _beside(diagram)
+    return rejected_among(diagram.faces, beside & among, beside)
+
+
+def _around(mesh: Faces, row: int) -> np.ndarray:
+    """Return which cells have a corner of a face, or a neighbor with one, (n,) bool."""
+    corners = mesh.corners[mesh.starts[row] : mesh.starts[row + 1]]
+    return with_neighbors(mesh, cells_of(mesh, rows_with(mesh.starts, np.isin(mesh.corners, corners))))
 
 
 def _without_face(mesh: Faces, row: int) -> Faces:

@@ -38,11 +38,14 @@ def rejected_at_walls(faces: Faces, judged: np.ndarray) -> np.ndarray:
     """Return which of the cells `judged` (n,) bool at walls, or beside these, OpenFOAM rejects, (k,) int."""
     walls = at_wall(faces)
     # Other faces are those of the diagram, whose tetrahedra are right.
-    return _rejected(faces, judged & with_neighbors(faces, walls), walls)
+    return rejected_among(faces, judged & with_neighbors(faces, walls), walls)
 
 
-def _rejected(faces: Faces, judged: np.ndarray, doubtful: np.ndarray) -> np.ndarray:
-    """Return which of the cells `judged` (n,) bool OpenFOAM rejects, (k,) int; it tests faces of `doubtful` cells."""
+def rejected_among(faces: Faces, judged: np.ndarray, doubtful: np.ndarray) -> np.ndarray:
+    """Return which of the cells `judged` (n,) bool OpenFOAM rejects, (k,) int.
+
+    Only faces of `doubtful` cells (n,) bool are divided into tetrahedra, which takes the longest.
+    """
     kept = with_neighbors(faces, judged)
     if 2 * np.count_nonzero(kept) > len(kept):
         kept[:] = True
@@ -60,7 +63,7 @@ def spoiled_near_walls(before: Faces, made: Faces) -> np.ndarray:
     near = with_neighbors(before, touching_walls(before))
     judged = changed_cells(before, made, near) & near
     found = np.zeros(len(judged), bool)
-    found[_rejected(made, judged, judged)] = True
+    found[rejected_among(made, judged, judged)] = True
     return found
 
 
