@@ -225,14 +225,18 @@ def rejected_cells(mesh: Faces, divided: np.ndarray, judged: np.ndarray) -> np.n
 
 def rejected_polygons(mesh: Faces) -> np.ndarray:
     """Return which cells OpenFOAM rejects in 2D, (n,) bool: also those with a face that it rejects."""
-    m = PlaneMeasures(mesh)
+    bad = np.bincount(mesh.sides()[0], minlength=mesh.n_cells) < 3
+    return bad | not_convex(mesh, _PLANE) | cells_beyond(PlaneMeasures(mesh))
+
+
+def not_convex(mesh: Faces, least: float) -> np.ndarray:
+    """Return which cells in 2D are no simple polygons, or turn left by less than `least` in a corner, (n,) bool."""
     starts, loop, broken = simple_loops(mesh)
     cell = np.repeat(np.arange(mesh.n_cells), np.diff(starts))
     turn = turns(mesh.points[loop], following(starts))
-    bad = (np.diff(starts) < 3) | (np.bincount(cell, turn, mesh.n_cells) > 3 * np.pi)  # 4 pi if sides cross
-    bad[broken] = True
-    bad[cell[turn < _PLANE]] = True
-    return bad | cells_beyond(m)
+    found = np.bincount(cell, turn, mesh.n_cells) > 3 * np.pi  # 4 pi if sides cross
+    found[broken] = found[cell[turn < least]] = True
+    return found
 
 
 def around_islands(mesh: Faces) -> Criterion | None:

@@ -40,10 +40,10 @@ def fewest_rejected(
     shift: Callable[[np.ndarray, np.ndarray, int], np.ndarray],
     remake: Callable[[np.ndarray, np.ndarray, T, int], T | None],
 ) -> T:
-    """Return the mesh of the fewest rejected cells: the `first`, or one of those made again.
+    """Move generators of rejected cells; return the mesh of the fewest rejected cells, the `first` or a later one.
 
-    Rejected cells near each other are a group. Its moved generators stay there if it has fewer rejected cells
-    afterwards; others move back.
+    Rejected cells near each other are a group. If it has fewer of them after a move, the generators in it stay moved;
+    others move back.
 
     Parameters
     ----------
@@ -52,10 +52,11 @@ def fewest_rejected(
     rejected : callable
         Returns the generators of the rejected cells of a mesh, (k,) int; -1 for none.
     shift : callable
-        Returns all generators; those of some rows (k,) int, and those beside them, are moved. See `moved`.
+        Called with all generators, some rows (k,) int, and the number of the attempt. Returns all generators, with
+        those of the rows and beside them moved; see `moved`.
     remake : callable
-        Makes the mesh of other generators (n, 3); called with these, the rows, the best mesh, and the number of the
-        attempt. None ends the attempts.
+        Called with other generators (n, 3), the rows, the best mesh, and the number of the attempt. Returns the mesh of
+        these generators, or None, which ends the attempts.
     """
     best, bad = first, rejected(first)
     for move in range(_MOVES):
@@ -98,7 +99,7 @@ def moved(
     move: int,
     held: int = 0,
 ) -> np.ndarray:
-    """Return all generators (n, 3). Those of `rows` (k,) int and near these are moved, but stay in the domain.
+    """Return all generators (n, 3), with those of `rows` (k,) int and beside them moved. They stay in the domain.
 
     The two generators of a pair, on both sides of a surface inside, are moved together along the surface.
 
@@ -109,7 +110,7 @@ def moved(
     sizes : (n,) float
         h at the generators.
     move : int
-        The number of the attempt. It gives the directions.
+        The number of the attempt, which the random directions depend on.
     held : int
         How many of the first generators stay.
     """
@@ -119,33 +120,31 @@ def moved(
     away = np.random.default_rng(move).normal(size=(len(rows), 3))
     away *= (_MOVE * sizes[rows] / np.linalg.norm(away, axis=1))[:, None]
     sheets = None if domain.borders is None else domain.borders.sheets
-    group, least = np.arange(len(rows)), _DEEP * sizes[rows]
-    room = np.zeros(len(rows))
+    group, room = np.arange(len(rows)), np.zeros(len(rows))
     if sheets is not None:
         rows, away, group = _along(sheets, points, sizes, rows, away)
-        least = _DEEP * sizes[rows]
         room = np.minimum(sheets.distance(points[rows]), _FREE * sizes[rows])
         room[np.bincount(group)[group] > 1] = 0
     for sign in (1, -1):
         x = points[rows] + sign * away
-        good = depth(x) > least
+        good = depth(x) > _DEEP * sizes[rows]
         if sheets is not None:
             good &= sheets.distance(x) >= room
         whole = np.ones(int(group.max(initial=-1)) + 1, bool)
         whole[group[~good]] = False
         inside = whole[group]
         points[rows[inside]] = x[inside]
-        rows, away, group, least = rows[~inside], away[~inside], group[~inside], least[~inside]
-        room = room[~inside]
+        rows, away, group, room = (values[~inside] for values in (rows, away, group, room))
     return points
 
 
 def _along(
     sheets: Sheets, points: np.ndarray, sizes: np.ndarray, rows: np.ndarray, away: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return which generators move, how far, and with which others: `rows` (k,), the other ones of pairs after them.
+    """Return which generators move (k,), how far (k, 3), and their groups (k,).
 
-    Generators that move together have one number. They move as the first of them would, along all patches between them.
+    First come those of `rows`, then the other ones of their pairs. Generators that move together are a group. They move
+    as the first of them, but along all patches between them.
     """
     tree, given, new = scipy.spatial.KDTree(points), len(rows), rows
     pairs, normals = [np.zeros((0, 2), np.int64)], [np.zeros((0, 3))]

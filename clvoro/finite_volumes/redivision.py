@@ -1,8 +1,8 @@
 """Cells in 2D that OpenFOAM rejects: each is divided anew, together with a neighbor.
 
 The union of both cells is cut by another straight face. Where no cut of a union helps, the place of the cell is left
-out of the mesh, and the cell gets a part of its neighbor. So cells at dead ends and in channels that are one cell wide
-have faces in two directions, and what lies in throats and on needles needs no cells.
+out of the mesh, and the cell gets a part of another one. So cells at dead ends and in channels that are one cell wide
+have faces in two directions. Throats and needles that are narrower than a cell have none.
 """
 
 from __future__ import annotations
@@ -13,12 +13,10 @@ from typing import NamedTuple
 import numpy as np
 
 from ..geometry.polygon import Polygon
-from ..mesh.connectivity import following
 from ..mesh.faces import Faces
-from ..mesh.geometry import turns
 from ..mesh.straightening import cross
+from .gate import not_convex
 from .measures import PlaneMeasures
-from .prisms import simple_loops
 from .short_edges import STRAIGHT
 
 WORST = {"skewness": 3.5, "non_orthogonality": 60.0, "weight": 0.07, "volume_ratio": 0.015, "determinant": 2e-3}
@@ -32,8 +30,8 @@ BESIDE = 0.05
 LEAST_SHARE = 0.15
 """Least area of each half of a cut polygon, as a share of the whole."""
 FLAT, MOST_FILLED = 1e-3, (0.1, 1.0)
-"""Largest turn, in radians, of a wall that is made straight. Largest area that a polygon gains there, over its own: the
-second value is for cells that no cut with the first one helps."""
+"""Largest turn to the left, in radians, of a wall that is made straight. Largest area that a polygon gains there, over
+its own: 1.0 is for cells that no cut with 0.1 helps."""
 SHARPEST = 0.1
 """Least sine of the angles between a cut and the sides on which it ends."""
 TRIED = 24
@@ -43,6 +41,7 @@ RINGS = 2
 FAR = 10
 """Number of nearest cells of which one may be cut for a rejected cell, if cuts of its neighbors do not help."""
 ROUNDS = 4
+"""How often the cells that are bad then are divided anew, at most."""
 
 Side = tuple[int, int, int]
 """First and last point of a side, counter-clockwise around its cell, and the cell beyond; on a wall -1 - wall."""
@@ -76,7 +75,10 @@ def redivide(mesh: Faces, parts: np.ndarray, rejected: np.ndarray) -> Faces:
 
 
 def badness(mesh: Faces) -> np.ndarray:
-    """Return the worst measure of each cell and its faces over that of `WORST`, (n,); inf if it is not convex."""
+    """Return how bad each cell is, (n,): the largest ratio of its measures, and those of its faces, to `WORST`.
+
+    Cells above 1 are bad. Those that are not convex have inf.
+    """
     m, worst = PlaneMeasures(mesh), np.zeros(mesh.n_cells)
     for name, limit in WORST.items():
         values = getattr(m, name)
@@ -86,17 +88,14 @@ def badness(mesh: Faces) -> np.ndarray:
             continue
         np.maximum.at(worst, mesh.owner, values)
         np.maximum.at(worst, mesh.neighbor[: mesh.n_inner], values[: mesh.n_inner])
-    starts, loop, broken = simple_loops(mesh)
-    turn, cell = turns(mesh.points[loop], following(starts)), np.repeat(np.arange(mesh.n_cells), np.diff(starts))
-    worst[cell[turn < STRAIGHT / 2]] = worst[broken] = np.inf
-    worst[(m.areas <= 0) | (np.bincount(cell, turn, mesh.n_cells) > 3 * np.pi)] = np.inf
+    worst[not_convex(mesh, STRAIGHT / 2) | (m.areas <= 0)] = np.inf
     return worst
 
 
 class _Cut(NamedTuple):
-    """A cut of a polygon: the sides of both halves without the cut, its ends, and its new points by negative numbers.
+    """A cut of a polygon: the sides of both halves without the cut, its ends, and the places of new points.
 
-    The first half reaches from the first end along the outline to the second end.
+    New points have negative numbers. The first half reaches from the first end along the outline to the second end.
     """
 
     first: list[Side]
@@ -106,7 +105,7 @@ class _Cut(NamedTuple):
 
 
 class _Change(NamedTuple):
-    """The sides of cells after a change, and its new points by negative numbers."""
+    """The sides of cells after a change, and the places of its new points, which have negative numbers."""
 
     loops: Loops
     points: dict[int, np.ndarray]
@@ -135,7 +134,7 @@ class _Edit:
         self.changed: Loops = {}
 
     def sides_of(self, cell: int) -> list[Side]:
-        """Return the sides of `cell`, one after the other if they are one loop."""
+        """Return the sides of `cell`, in their order around it if they are one loop."""
         if cell in self.changed:
             return self.changed[cell]
         sides = [tuple(s) for s in self.sides[self.rows[self.starts[cell] : self.starts[cell + 1]]].tolist()]
@@ -146,7 +145,7 @@ class _Edit:
         return found if found[-1][1] == found[0][0] and len({s[0] for s in found}) == len(sides) else sides
 
     def change(self, cell: int) -> None:
-        """Divide `cell` and another cell anew, by the cut that leaves the fewest bad cells and the best of them."""
+        """Divide `cell` and another one anew, if that helps: a neighbor, or else one of the nearest cells."""
         near = sorted({side[2] for side in self.sides_of(cell) if side[2] >= 0} - {cell})
         for most in MOST_FILLED:
             if self._try(cell, near, True, most) or self._try(cell, near, False, most):
@@ -155,9 +154,11 @@ class _Edit:
         self._try(cell, [c for c in order[1:FAR].tolist() if c not in near], False, MOST_FILLED[-1])
 
     def _try(self, cell: int, others: list[int], union: bool, most: float) -> bool:
-        """Divide the `union` of a cell and one of `others`, or that one alone; return whether fewer cells are bad.
+        """Divide a cell and one of `others` anew if fewer cells are bad then; return whether that is so.
 
-        Of all cuts the one is taken that leaves the fewest bad cells, and of these the best.
+        With `union` the two cells together are cut. Without it the other one alone is cut, and walls take the place of
+        `cell`. The cut taken leaves the fewest bad cells, and of such cuts the one whose worst cell is the best.
+        `most` is one of `MOST_FILLED`.
         """
         best: tuple[tuple[int, float], _Change] | None = None
         for other in others:
@@ -180,7 +181,7 @@ class _Edit:
         return True
 
     def _around(self, *cells: int) -> tuple[Loops, list[int]]:
-        """Return the sides of the cells around `cells`, and those of which all neighbors are there."""
+        """Return the sides of `cells` and of `RINGS` around them, and the cells without those of the outermost ring."""
         around, known = [list(cells)], set(cells)
         for _ in range(RINGS):
             near = sorted({side[2] for c in around[-1] for side in self.sides_of(c) if side[2] >= 0} - known)
@@ -216,9 +217,10 @@ class _Edit:
         return loops.get(other, local[other]), loops
 
     def _changed(self, cell: int, other: int, cut: _Cut, loops: Loops) -> _Change:
-        """Return what cells are after a cut: `cell` and `other` have a half each, the one nearer to its generator."""
+        """Return the cells after a cut: `cell` and `other` get one half each, near their generators."""
         halves, (p, q) = (cut.first, cut.second), cut.ends
-        middles = np.array([np.mean([cut.points.get(s[0], self._at(s[0])) for s in half], axis=0) for half in halves])
+        places = {**cut.points, **{s[0]: self.points[s[0]] for half in halves for s in half if s[0] >= 0}}
+        middles = np.array([np.mean([places[s[0]] for s in half], axis=0) for half in halves])
         x = self.old.generators[[cell, other]]
         if np.hypot(*(x - middles).T).sum() > np.hypot(*(x - middles[::-1]).T).sum():
             halves, (p, q) = halves[::-1], (q, p)
@@ -237,12 +239,8 @@ class _Edit:
                     a = ahead[a][1]
         return _Change(made, cut.points)
 
-    def _at(self, point: int) -> np.ndarray:
-        """Return the place of a point; that of any for a new one."""
-        return self.points[max(point, 0)]
-
     def _straightened(self, outline: list[Side], most: float) -> list[Side]:
-        """Return a polygon without the points of walls where it is not convex and does not grow by more than `most`.
+        """Return a polygon without points between two walls where it is flat or not convex; see `MOST_FILLED`.
 
         Points stay where the named part changes.
         """
@@ -263,9 +261,9 @@ class _Edit:
         return found
 
     def _cuts(self, outline: list[Side]) -> list[_Cut]:
-        """Return cuts of a polygon in two convex ones, those with the roundest halves first.
+        """Return cuts of a polygon into two convex ones, those with the roundest halves first.
 
-        Cuts end in corners, or in new points on sides.
+        A cut ends in corners or in new points on sides. The less round half counts.
         """
         count, step = len(outline), len(SHARES) + 1
         corner = np.array([self.points[side[0]] for side in outline])
@@ -356,7 +354,7 @@ class _Edit:
 def _faces(
     old: Faces, generators: np.ndarray, points: np.ndarray, ends: np.ndarray, owner: np.ndarray, neighbor: np.ndarray
 ) -> Faces:
-    """Return a mesh from the ends (f, 2) and cells of its faces, which come in the order of meshes."""
+    """Return a mesh from the ends (f, 2) and cells of its faces, sorted as in all meshes: inner faces first."""
     inner = neighbor >= 0
     order = np.lexsort((np.where(inner, neighbor, owner), np.where(inner, owner, -1 - neighbor), ~inner))
     return replace(
