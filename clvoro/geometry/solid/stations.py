@@ -284,18 +284,14 @@ def _divide(
     count = max(round(float(reached[-1]) - (sum(ends) - 2)), int(reached[-1] > shortest))
     if line.closed:
         count = max(count, 3)
-    if ends == (1.0, 1.0):
-        marks = np.arange(2 * count + 1) / max(2 * count, 1) * reached[-1]
-        scale = reached[-1] / max(count, 1)
-    else:
+    if ends != (1.0, 1.0):
         count = max(count, 2)
-        lengths = np.ones(count)
-        lengths[0], lengths[-1] = ends
-        scale = reached[-1] / lengths.sum()
-        marks = np.append(0, np.cumsum(np.repeat(0.5 * scale * lengths, 2)))
-    at = np.interp(marks, reached, s)
+    lengths = np.ones(count)
+    lengths[:1], lengths[-1:] = ends
+    marks, whole = np.append(0, np.cumsum(np.repeat(lengths / 2, 2))), lengths.sum() or 1
+    at = np.interp(marks / whole * reached[-1], reached, s)
     # Cells are as long along the line as across it.
-    return at[::2], at[1::2], np.interp(at[1::2], s, h) * scale
+    return at[::2], at[1::2], np.interp(at[1::2], s, h) * (reached[-1] / whole)
 
 
 def share_corners(chains: Sequence[ChainOfChords]) -> None:
