@@ -66,14 +66,15 @@ class MeshOfCase:
         empty = volume == 0
         means = sums / np.where(empty, 1, volume)[:, None]
         if empty.any():
-            nearest = scipy.spatial.KDTree(self.foam.centroids[:, : self.diagram.domain.dim]).query(
-                self.diagram.points[empty]
-            )[1]
-            means[empty] = values[nearest]
+            means[empty] = values[self._nearest(self.diagram.points[empty])]
         return means
 
+    def _nearest(self, points: np.ndarray) -> np.ndarray:
+        """Return for each of `points` (n, d) the cell of OpenFOAM with the nearest centroid, (n,) int."""
+        return scipy.spatial.KDTree(self.foam.centroids[:, : self.diagram.domain.dim]).query(points)[1]
+
     def zones_on(self, new: Diagram) -> dict[str, np.ndarray]:
-        """Return the zones of cells on a new diagram, one bool per cell each, by name: those of the nearest old cells.
+        """Return by name which cells of a new diagram are in each zone, (n,) bool: those whose nearest old cell is.
 
         Regions of the domain are left out, since the new mesh has them by itself.
 
@@ -86,7 +87,7 @@ class MeshOfCase:
         zones = {name: rows for name, rows in self.foam.zones.items() if name not in known}
         if not zones:
             return {}
-        nearest = scipy.spatial.KDTree(self.foam.centroids[:, : new.domain.dim]).query(new.points)[1]
+        nearest = self._nearest(new.points)
         made = {name: np.isin(nearest, rows) for name, rows in zones.items()}
         for name, inside in made.items():
             if not inside.any():
@@ -97,7 +98,7 @@ class MeshOfCase:
 
 
 def entries_at(field: FoamField, patch: FoamPatchFaces) -> Entries:
-    """Return the entries of a field at a patch: of its name, else of a group, else of the last pattern that fits it.
+    """Return the entries of a field for a patch: by its name, else by a group, else by the last pattern that fits.
 
     Raises
     ------
