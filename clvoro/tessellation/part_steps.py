@@ -125,32 +125,21 @@ class BallGroups:
     def facing(self, facts: np.ndarray) -> Facing:
         """Return how far these balls are from the boxes of another part, which has sent its `facts` (k, 2 d + 2)."""
         boxes, largest, sizes = facts[:, :-2], facts[:, -2], self.chunks.sizes
-        dim, hull, own = self.centers.shape[1], around(boxes), np.repeat(self.largest, sizes)
-        away = np.repeat(gaps(self.boxes, hull)[:, 0], sizes)
-        near = np.flatnonzero(away <= NEAR * np.maximum(own, largest.max()))
+        hull, groups = around(boxes), np.repeat(np.arange(len(sizes)), sizes)
+        farthest = NEAR * np.maximum(self.largest, largest.max())[groups]
+        away = gaps(self.boxes, hull)[groups, 0]
+        near = np.flatnonzero(away <= farthest)
         away[near] = gaps(np.tile(self.centers[near], 2), hull)[:, 0]
-        near = near[away[near] <= NEAR * np.maximum(own[near], largest.max())]
-        groups = np.repeat(np.arange(len(sizes)), sizes)[near]
-        firsts = np.flatnonzero(np.diff(groups, prepend=-1))
-        counts = np.diff(np.append(firsts, len(near)))
-        centers = self.centers[near]
-        lower, upper = (f.reduceat(centers, firsts, axis=0) if len(near) else centers for f in EXTREMES)
-        meets = gaps(np.hstack([lower, upper]), boxes) <= NEAR * np.maximum.outer(own[near[firsts]], largest)
-        # A ball is compared with all boxes near its group.
-        per_group = meets.sum(axis=1)
-        numbers, begins = (np.repeat(values, counts) for values in (per_group, np.cumsum(per_group) - per_group))
-        begins += numbers - np.cumsum(numbers)
-        others = np.nonzero(meets)[1][np.repeat(begins, numbers) + np.arange(numbers.sum())]
-        places = np.repeat(near, numbers)
-        ways2 = np.zeros(len(places))
-        for axis in range(dim):
-            x = self.centers[places, axis]
-            way = np.maximum(np.maximum(boxes[others, axis] - x, x - boxes[others, dim + axis]), 0)
-            ways2 += way * way
-        ways = np.sqrt(ways2)
-        kept = ways <= NEAR * np.maximum(own[places], largest[others])
-        away[near] = np.maximum(away[near], NEAR * own[near])
-        return Facing(facts, away, places[kept], others[kept], ways[kept])
+        near = near[away[near] <= farthest[near]]
+        pairs = [(np.empty(0, int), np.empty(0, int), np.empty(0))]
+        for rows in np.split(near, 1 + np.flatnonzero(np.diff(groups[near]))) if len(near) else []:
+            centers, limits = np.tile(self.centers[rows], 2), NEAR * np.maximum(self.largest[groups[rows[0]]], largest)
+            beside = np.flatnonzero(gaps(around(centers), boxes)[0] <= limits)
+            ways = gaps(centers, boxes[beside])
+            balls, others = np.nonzero(ways <= limits[beside])
+            pairs.append((rows[balls], beside[others], ways[balls, others]))
+        away[near] = np.maximum(away[near], NEAR * self.largest[groups[near]])
+        return Facing(facts, away, *(np.concatenate(columns) for columns in zip(*pairs, strict=True)))
 
     def meeting(self, facing: Facing) -> np.ndarray:
         """Return which balls, with their skins, meet a box in which the other part has generators, (m,) int."""
@@ -239,16 +228,19 @@ def inside(points: np.ndarray, balls: np.ndarray) -> np.ndarray:
     """Return which of `points` (n, d) are in one of the `balls` (m, d + 1), (n,) bool.
 
     The center of a ball with radius r gets one more coordinate, sqrt(R^2 - r^2), where R is the largest radius; that of
-    a point is 0. A point is then in the ball if it is nearer than R to the center.
+    a point is 0. A point is then in the ball if it is nearer than R to the center. Searches are slow if most radii are
+    much smaller than R. So each search has balls whose r^2 are within a factor of two.
     """
-    if not len(points) or not len(balls):
-        return np.zeros(len(points), bool)
-    radii = balls[:, -1]
-    largest = radii.max()
-    centers = np.column_stack([balls[:, :-1], np.sqrt((largest - radii) * (largest + radii))])
-    places = np.column_stack([points, np.zeros(len(points))])
-    near, _ = scipy.spatial.cKDTree(centers).query(places, distance_upper_bound=largest * (1 + 1e-9))
-    return np.isfinite(near)
+    found = np.zeros(len(points), bool)
+    classes = np.frexp(np.square(balls[:, -1]))[1]
+    for same in np.unique(classes):
+        centers, rest = balls[classes == same], np.flatnonzero(~found)
+        radii, places = centers[:, -1].copy(), np.column_stack([points[rest], np.zeros(len(rest))])
+        largest = radii.max()
+        centers[:, -1] = np.sqrt((largest - radii) * (largest + radii))
+        near, _ = scipy.spatial.cKDTree(centers).query(places, distance_upper_bound=largest * (1 + 1e-9))
+        found[rest] = np.isfinite(near)
+    return found
 
 
 class PartSteps(DomainSteps):
