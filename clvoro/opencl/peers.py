@@ -6,7 +6,7 @@ import json
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, TypeVar, cast
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar, cast
 
 import numpy as np
 
@@ -30,6 +30,17 @@ GRACE = 1.0
 """Seconds for which rank 0 waits for answers to the exit code. The others wait 1.5 times as long for the code."""
 
 
+class Swap(NamedTuple):
+    """An array with the rows that a part sends, and one for the rows that it receives, both in the order of parts."""
+
+    sent: np.ndarray
+    sent_sizes: np.ndarray
+    """(p,) int. Number of rows for each part."""
+    received: np.ndarray
+    sizes: np.ndarray
+    """(p,) int. Number of rows from each part."""
+
+
 class Peers:
     """The parts of a domain as one of them sees them. All of them call the same methods in the same order.
 
@@ -45,7 +56,8 @@ class Peers:
     gathers : bool
         Whether this part gathers the mesh of all parts at the end of each run.
     exchanges, reductions, waits : int
-        Calls of `exchange` and of `gather` so far, with what `swap` does of both, and how often this part has waited.
+        How often this part has exchanged arrays, gathered values and waited so far. `swap` counts as an exchange, and
+        with `values` as a gather, too.
     """
 
     number, count, shared, gathers = 0, 1, False, False
@@ -59,21 +71,10 @@ class Peers:
         """
         return list(sent)
 
-    def swap(
-        self,
-        sent: np.ndarray,
-        sent_sizes: np.ndarray,
-        received: np.ndarray,
-        sizes: np.ndarray,
-        values: np.ndarray | None = None,
-    ) -> list[np.ndarray]:
-        """Send the rows of one array to all parts, and write the rows of all parts to `received`.
-
-        Both arrays are in the order of parts: `sent_sizes` (p,) rows go to each part, `sizes` (p,) come from each.
-        If there are `values`, the method also returns what `gather` returns, and the parts wait only once for both.
-        """
-        found = self.exchange(np.split(sent, np.cumsum(sent_sizes)[:-1]), sizes)
-        np.concatenate(found, out=received)
+    def swap(self, rows: Swap, values: np.ndarray | None = None) -> list[np.ndarray]:
+        """Send and receive `rows`. With `values` also return what `gather` returns; parts wait only once for both."""
+        found = self.exchange(np.split(rows.sent, np.cumsum(rows.sent_sizes)[:-1]), rows.sizes)
+        np.concatenate(found, out=rows.received)
         return [] if values is None else self.gather(values)
 
     def gather(self, values: np.ndarray) -> list[np.ndarray]:
@@ -148,7 +149,7 @@ class Peers:
         """Tell the others that this part has failed. Those that wait for a message raise a `RankError`."""
 
     def close(self, code: int) -> None:
-        """On part 0: send the exit `code` to the others, and end all processes if one of them does not answer."""
+        """On part 0: send the exit `code` to the others. If one of them does not answer, end all processes."""
 
     def await_close(self) -> int | None:
         """On the other parts: return the exit code of part 0, or None if none arrives in time."""
@@ -210,20 +211,13 @@ class Ranks(Peers):
         self._complete(requests)
         return received
 
-    def swap(
-        self,
-        sent: np.ndarray,
-        sent_sizes: np.ndarray,
-        received: np.ndarray,
-        sizes: np.ndarray,
-        values: np.ndarray | None = None,
-    ) -> list[np.ndarray]:
+    def swap(self, rows: Swap, values: np.ndarray | None = None) -> list[np.ndarray]:
         """Send and receive slices of both arrays."""
         self.exchanges += 1
-        requests, row = [], sent.dtype.itemsize * math.prod(sent.shape[1:])
-        given, taken = _bytes(sent), _bytes(received)
-        for buffer, counts, begin in ((taken, sizes, self._comm.Irecv), (given, sent_sizes, self._comm.Isend)):
-            ends = np.cumsum(counts) * row
+        requests, row = [], rows.sent.dtype.itemsize * math.prod(rows.sent.shape[1:])
+        sends = rows.sent, rows.sent_sizes, self._comm.Isend
+        for array, counts, begin in ((rows.received, rows.sizes, self._comm.Irecv), sends):
+            buffer, ends = _bytes(array), np.cumsum(counts) * row
             requests += [
                 begin(buffer[end - row * size : end], part)
                 for part, (end, size) in enumerate(zip(ends.tolist(), counts.tolist(), strict=True))

@@ -11,7 +11,7 @@ import numpy as np
 
 from ..arguments import WARNING, warn
 from ..errors import RankError
-from .peers import Peers
+from .peers import Peers, Swap
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -21,9 +21,9 @@ _Calls: TypeAlias = "queue.SimpleQueue[Callable[[], object] | None]"
 
 
 class _Table:
-    """Where threads hand over what each of them gives, and wait for each other.
+    """Hands over objects among threads, in rounds. In each round a thread gives one object, and waits for all others.
 
-    What they give in one round stays there in the next one, while other threads may still read it.
+    Objects of one round are kept during the next one, since other threads may still read them.
     """
 
     def __init__(self, count: int) -> None:
@@ -32,7 +32,7 @@ class _Table:
         self._closed = ""
 
     def hand_over(self, number: int, given: Any) -> list[Any]:
-        """Return what all threads give, in their order; this is thread `number`.
+        """Give an object as thread `number`, and return the objects of all threads in their order.
 
         Raises
         ------
@@ -89,25 +89,15 @@ class Threads(Peers):
         given = self._table.hand_over(self.number, [np.array(values) for values in sent])
         return [arrays[self.number] for arrays in given]
 
-    def swap(
-        self,
-        sent: np.ndarray,
-        sent_sizes: np.ndarray,
-        received: np.ndarray,
-        sizes: np.ndarray,
-        values: np.ndarray | None = None,
-    ) -> list[np.ndarray]:
-        """Hand over a copy of the array, of which each part takes its slice, and of `values`."""
+    def swap(self, rows: Swap, values: np.ndarray | None = None) -> list[np.ndarray]:
+        """Hand over copies of the rows for each part, and of `values`."""
         self.exchanges += 1
         self.reductions += values is not None
-        ends, to, found = np.cumsum(sent_sizes).tolist(), 0, []
-        own = None if values is None else np.array(values)
-        for rows, others, gathered in self._table.hand_over(self.number, (np.array(sent), ends, own)):
-            first, last = others[self.number - 1] if self.number else 0, others[self.number]
-            received[to : to + last - first] = rows[first:last]
-            to += last - first
-            found.append(gathered)
-        return [] if values is None else found
+        sent = np.split(np.array(rows.sent), np.cumsum(rows.sent_sizes)[:-1])
+        given = sent, None if values is None else np.array(values)
+        arrays, found = zip(*self._table.hand_over(self.number, given), strict=True)
+        np.concatenate([pieces[self.number] for pieces in arrays], out=rows.received)
+        return [] if values is None else list(found)
 
     def fail(self, error: BaseException) -> None:
         """Let all calls of other threads, and further ones of this thread, raise an error."""
@@ -144,7 +134,7 @@ class Team:
     Attributes
     ----------
     peers : tuple of Threads
-        What each of them sees.
+        The parts of the domain as each thread sees them.
     interrupted : bool
         Whether the user has pressed Ctrl-C since they began to work.
     """
@@ -164,14 +154,14 @@ class Team:
     def run(self, work: Callable[[Threads], Made]) -> list[Made]:
         """Call `work` in all threads, and return the results in their order.
 
-        Warnings of the first part are given in the thread that calls this; those of the others, which are the same, are
-        not given. After Ctrl-C `interrupted` is True, and `work` should end soon; a second Ctrl-C ends it.
+        Warnings of the first part are given in the thread that calls this. The others have the same ones, which are
+        left out. After Ctrl-C `interrupted` is True, and `work` should end soon; a second Ctrl-C ends it.
 
         Raises
         ------
         BaseException
-            The first error of a thread, after all of them have ended. `RankError` of threads that only wait for it does
-            not count.
+            The first error of a thread, after all threads have ended. A `RankError` is raised only if there is no other
+            error.
         """
         calls: _Calls = queue.SimpleQueue()
         table, results = _Table(len(self.peers)), [None] * len(self.peers)

@@ -25,7 +25,7 @@ import pyopencl.array as cla
 from ..geometry.domain import ClipBox
 from ..opencl.device_array import buffer_of
 from ..opencl.engine import Engine, PartialSums
-from ..opencl.peers import Peers
+from ..opencl.peers import Peers, Swap
 
 if TYPE_CHECKING:
     from .device_diagram import Tessellation
@@ -99,11 +99,11 @@ class Ghosts:
                 # If sums are read next, this copy is complete then.
                 copy = cl.enqueue_copy(engine.queue, packed, buffer_of(given), is_blocking=sums is None)
             received, totals = np.empty((g, row), np.uint32), np.empty(0)
-            rows = packed, np.asarray(self.sent_counts), received, np.asarray(self.counts)
+            rows = Swap(packed, np.asarray(self.sent_counts), received, np.asarray(self.counts))
             if sums is None:
-                self.peers.swap(*rows)
+                self.peers.swap(rows)
             else:
-                totals = engine.sum_over_parts(sums, partial(self.peers.swap, *rows))
+                totals = engine.sum_over_parts(sums, partial(self.peers.swap, rows))
             del copy
             if g and len(values) == 1:
                 engine.send(received, values[0], n_own * 4 * row)

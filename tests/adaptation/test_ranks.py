@@ -62,7 +62,7 @@ def messages():
     ranks, (mine, theirs) = peers.Ranks(MPI.COMM_WORLD), (np.full((k + 2, 2), k) for k in (rank, 1 - rank))
     received = np.empty((len(theirs), 2), int)
     sizes = [np.where(np.arange(2) == rank, 0, len(rows)) for rows in (mine, theirs)]
-    sums = ranks.swap(mine, sizes[0], received, sizes[1], np.array(rank))
+    sums = ranks.swap(peers.Swap(mine, sizes[0], received, sizes[1]), np.array(rank))
     assert np.array_equal(received, theirs)
     assert np.array_equal(ranks.exchange([mine] * 2)[1 - rank], theirs)
     assert [int(k) for k in sums] == [int(k) for k in ranks.gather(np.array(rank))] == [0, 1]
