@@ -1,25 +1,25 @@
 """Model of the time of a step over many ranks: the cells, the values of ghosts, and the waiting for messages.
 
-    python bench/rank_model.py [--cells 1e10] [--ranks 8,64,512,1000] [--dim 3] [--rate 5e6] [--exchanges 30]
-                               [--reductions 24] [--ghosts 1.2] [--words 1.5] [--bandwidth 2e10] [--latency 5e-6]
+    python bench/rank_model.py [--cells 1e10] [--ranks 8,64,512,1000] [--dim 3] [--rate 5e6] [--exchanges 20]
+                               [--reductions 18] [--ghosts 2] [--words 1.5] [--bandwidth 2e10] [--latency 5e-6]
                                [--copy 2e-5] [--json]
 
 Nothing is measured here. Assumptions, each of them an option:
 
-- a device takes `--rate` cells per second in a step, and as many ghosts where they get cells (2D);
+- a device makes `--rate` cells per second in a step, in 2D also those of ghosts;
 - in a step a rank exchanges the values of ghosts `--exchanges` times, and takes `--reductions` sums over all ranks, as
   `bench/parallel.py` counts them; an exchange sends `--words` numbers of 8 bytes for each ghost in the mean;
-- a rank has `--ghosts` times 2 d (n / p)^((d - 1) / d) ghosts, the column `ghosts` of that script, and a message to
-  each of 26 neighbors (8 in 2D) in an exchange;
+- a rank has `--ghosts` times 2 d (n / p)^((d - 1) / d) ghosts, the column `ghosts` of that script, and sends a message
+  to each of 26 neighbors (8 in 2D) in an exchange;
 - the network has `--bandwidth` bytes per second and rank, and `--latency` seconds per message; a sum over p ranks waits
   for 2 log2(p) of them; each exchange and each sum also waits for two copies of `--copy` seconds between device and
   host;
-- the largest rank has 1.1 times the mean, up to which generators stay with their ranks.
+- the largest rank has 1.1 times the mean number of cells: above that, generators are divided anew.
 
-What hosts compute is not counted: the search for ghosts, which `bench/parallel.py` shows in `CPU s`.
+The search for ghosts on the hosts is not counted; `bench/parallel.py` has it in `CPU s`.
 
-`efficiency` is the time of a device alone for the mean number of cells over that of the step. Labels have 32 bits: more
-than 2e9 cells need longer ones, which the model does not count.
+`efficiency` is the time that one device takes for the mean number of cells, divided by the time of the step. Labels
+have 32 bits. More than 2e9 cells need longer labels, which the model does not count.
 """
 
 from __future__ import annotations
@@ -49,9 +49,9 @@ def main() -> None:
     p.add_argument("--ranks", type=counts, default=[8, 64, 512, 1000], help="numbers of ranks")
     p.add_argument("--dim", type=int, choices=(2, 3), default=3, help="dimension")
     p.add_argument("--rate", type=float, default=5e6, help="cells per second of a device")
-    p.add_argument("--exchanges", type=float, default=30, help="exchanges of ghosts in a step")
-    p.add_argument("--reductions", type=float, default=24, help="sums over all ranks in a step")
-    p.add_argument("--ghosts", type=float, default=1.2, help="ghosts over one layer around a part")
+    p.add_argument("--exchanges", type=float, default=20, help="exchanges of ghosts in a step")
+    p.add_argument("--reductions", type=float, default=18, help="sums over all ranks in a step")
+    p.add_argument("--ghosts", type=float, default=2, help="ghosts over one layer around a part")
     p.add_argument("--words", type=float, default=1.5, help="numbers per ghost in an exchange")
     p.add_argument("--bandwidth", type=float, default=2e10, help="bytes per second and rank")
     p.add_argument("--latency", type=float, default=5e-6, help="seconds per message")
