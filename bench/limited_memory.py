@@ -1,4 +1,4 @@
-"""A run on devices that each may hold a share of what the mesh needs: refused in one part, done in several.
+"""A run on devices with too little memory for the whole mesh: refused on one device, done over ranks.
 
     python bench/limited_memory.py [--cells 60000] [--share 0.2] [--ranks 16] [--dim 2] [--effort fast]
                                    [--device NAME] [--dtype float32] [--json]
@@ -55,10 +55,10 @@ def run_rank(options: argparse.Namespace) -> None:
 
 
 def main() -> None:
-    """Run in one part and over ranks, and print a table."""
+    """Run in one process and over ranks, and print a table."""
     p = parser(__doc__)
     p.add_argument("--cells", type=lambda text: round(float(text)), default=60_000)
-    p.add_argument("--share", type=float, default=0.2, help="what a device may hold, over what the mesh needs")
+    p.add_argument("--share", type=float, default=0.2, help="limit, as a share of the memory that one device needs")
     p.add_argument("--ranks", type=int, default=16, help="number of parts")
     p.add_argument("--dim", type=int, choices=(2, 3), default=2)
     p.add_argument("--effort", choices=("fast", "default", "best"), default="fast")

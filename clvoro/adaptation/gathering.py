@@ -21,7 +21,7 @@ _OF_CELLS = ("target_size", "size_error", "quality", "origin")
 
 @dataclass(frozen=True)
 class ResultParts:
-    """The other parts of a mesh, as the result of one of them sees them."""
+    """What the mesh of one part needs to join those of the others."""
 
     engine: Engine
     domain: Domain
@@ -50,7 +50,7 @@ class ResultParts:
         self.engine.peers.agree(work)
 
     def owners(self) -> np.ndarray:
-        """Return on part 0 which part owns each cell of the whole mesh, (n,) int; on others an empty array."""
+        """Return the number of the part that owns each cell of the whole mesh, (n,) int: on part 0; elsewhere empty."""
         labels = self.engine.peers.collect(self.labels)
         parts = np.repeat(np.arange(len(labels)), [len(own) for own in labels])
         return parts[np.argsort(np.concatenate([np.empty(0, np.int32), *labels]), kind="stable")]

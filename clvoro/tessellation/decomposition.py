@@ -81,9 +81,9 @@ def is_balanced(n: int, peers: Peers) -> bool:
 
 
 def distribute(engine: Engine, box: ClipBox, rows: dict) -> dict:
-    """Exchange generators, so that each part has those that it owns from now on, and return their arrays by name.
+    """Send generators to the parts that own them from now on, and return the new arrays of this part by name.
 
-    `rows` are the arrays before, on the device, and are freed. ``rows["points"]`` are in the device's coordinates in
+    `rows` are its present arrays on the device. They are freed. ``rows["points"]`` are in the device's coordinates in
     `box`. All parts call this together.
     """
     peers = engine.peers

@@ -43,8 +43,8 @@ RUN = 32
 JUMP = 8
 """Number of spacings between successive generators beyond which a new chunk begins."""
 GROWTH, SKIN = 1.4, 0.15
-"""Radius of the balls of a part, over that of the balls that its cells need. Width of the skin around each ball, as a
-share of this radius: a part asks for the generators in the skin, too, because they may move into the ball."""
+"""`GROWTH`: radius of the balls of a part, divided by the radius that its cells need. `SKIN`: width of the skin around
+each ball, as a share of the ball's radius. A part also asks for generators in the skin: they may move into the ball."""
 NEAR, FREE = 1.2, 0.8
 """Largest distance between a ball and a box of another part that are compared, over the largest radius of the balls of
 both. Radius around a generator within which all others are known, over its distance from other parts."""
@@ -52,8 +52,8 @@ EXTREMES = np.minimum, np.maximum
 NOISE = {"float64": 1e-6, "float32": 1e-4}
 """Bound of the round-off of a reach, as a share of it."""
 FILLED, MATCHED = {"float64": 1e-8, "float32": 1e-3}, {"float64": 1e-5, "float32": 1e-3}
-"""Largest relative differences between the volume of all cells and that of the domain, and between the measures of both
-sides of the faces between parts."""
+"""`FILLED`: largest relative difference between the volume of all cells and that of the domain. `MATCHED`: largest
+relative difference between the measures of faces between parts, seen from both sides."""
 MOST_GHOSTS = 0.5
 """In 3D cells are built anew, and not updated, if there are more ghosts than this share of the own generators: too many
 cells are beside ghosts."""
@@ -64,7 +64,7 @@ FAILED = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
 
 
 class Chunks:
-    """The generators of a part in chunks of successive ones. Generators in the order of bins are near each other then.
+    """The generators of a part, divided into chunks. Generators of a chunk are near each other, since they follow bins.
 
     Parameters
     ----------
@@ -78,8 +78,8 @@ class Chunks:
         Where the chunks begin.
     sizes : (k,) int
     spacings : (n,) float
-        For each generator an estimate of the spacing around it: the median distance of successive generators in a run
-        of `RUN`, the largest of its run and the two beside it.
+        An estimate of the spacing around each generator. A run of `RUN` generators has the median distance between
+        successive ones; the estimate is the largest of three runs, that of the generator and the two beside it.
     """
 
     def __init__(self, points: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> None:
@@ -99,7 +99,7 @@ class Chunks:
 
 
 class BallGroups:
-    """The balls in which a part has to know all generators, in groups: the chunks of their centers.
+    """The balls in which a part has to know all generators. The balls around the generators of a chunk are a group.
 
     Parameters
     ----------
@@ -181,10 +181,10 @@ class Answers:
     facing : dict of Facing
         By the numbers of the other parts, or in a periodic box of the images of all parts.
     given : list of (k,) int32
-        For each of these, the own generators in its balls that it has not known.
+        The own generators in the balls of each of these that it did not know before.
     new : list of (k, d + 3) float
-        The generators that each part has given: their rows there, whether the cells of this part need them, their
-        positions as this part sees them, and the number of the image.
+        The generators that each part has given: their rows in that part, whether cells of this part need them, their
+        positions (of the image, in a periodic box), and the number of the image.
     """
 
     balls: BallGroups
@@ -199,7 +199,7 @@ class Answers:
         return int(sum(rows[:, 1].sum() for rows in self.new))
 
     def shrink(self) -> None:
-        """Make the balls smaller, until the given generators, which do not become ghosts, are outside of the skins."""
+        """Make the balls smaller, so that no given generator is in a skin: these generators do not become ghosts."""
         places, balls = np.concatenate([rows[:, 2:-1] for rows in self.new]), self.balls
         if len(places) and len(self.asked):
             tree = scipy.spatial.cKDTree(places)
@@ -281,7 +281,7 @@ class PartSteps(DomainSteps):
         return not self.stages.cells.from_previous
 
     def begin(self, n: int, last: bool = False, labels: cla.Array | None = None) -> None:
-        """Note the labels of the generators, and count the rounds of a new diagram."""
+        """Note the labels of the generators, and begin to count the rounds of a new diagram."""
         assert labels is not None, "generators of parts have labels"
         self._given, self.rounds = labels, 0
 
@@ -328,7 +328,7 @@ class PartSteps(DomainSteps):
         order = np.argsort(self._sides, kind="stable")
         self._sides, self._rows = self._sides[order], self._rows[order]
         parts, way = np.divmod(self._sides, ways)
-        # The other part has this one on the opposite side.
+        # This part is on the opposite side of the other part.
         sent = [np.concatenate(self._sent[k : k + ways][::-1]) for k in range(0, len(self._sent), ways)]
         codes = engine.upload((self._images[way] + 1) @ 3 ** np.arange(engine.dim), np.int32)
         self._ghosts = replace(Ghosts.of_lists(engine, self.peers, parts, self._rows, sent), codes=codes)
@@ -338,11 +338,11 @@ class PartSteps(DomainSteps):
         self._all_labels = engine.upload(np.concatenate([labels, *found]), np.int32)
 
     def _note(self, points: cla.Array) -> None:
-        """Keep the positions of own generators, for which the limits hold, and upload the limits."""
+        """Keep the positions of own generators, at which the limits hold, and upload the limits."""
         engine, n = self.stages.engine, len(self._caps)
         self._at = self._room("at", size=n * engine.dim).reshape(n, engine.dim)
         cl.enqueue_copy(engine.queue, buffer_of(self._at), buffer_of(points), byte_count=self._at.nbytes)
-        # Rounded towards smaller ones.
+        # Single precision must not round limits up.
         self._limits_there = engine.upload(self._limits * (1 - 1e-6), np.float32)
 
     def builds_all(self, part: Part, complete: bool, enough: bool) -> bool:
@@ -478,7 +478,7 @@ class PartSteps(DomainSteps):
         return Answers(balls, np.unique(np.concatenate(asked)), facing, given, peers.exchange(sent))
 
     def _joined(self, tables: list[np.ndarray]) -> list[np.ndarray]:
-        """Return one array for each part, of those for all of its sides; a last column is the number of the way."""
+        """Join the tables of all sides of each part to one array, whose last column is the number of the image."""
         ways = len(self._shifts)
         numbered = [np.column_stack([rows, np.full(len(rows), k % ways)]) for k, rows in enumerate(tables)]
         return [np.concatenate(numbered[k : k + ways]) for k in range(0, len(numbered), ways)]
@@ -497,7 +497,7 @@ class PartSteps(DomainSteps):
     def _unknown(self, own: BallGroups, balls: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the own generators in `balls` (m, d + 2) that are not among the `known` ones, and their positions.
 
-        A row of `balls` is a center and two radii. The first, which the cells of the other part need, does not count.
+        A row of `balls` has a center and two radii. The first, which cells of the other part need, is not used.
         """
         dim = own.centers.shape[1]
         if not len(balls):
