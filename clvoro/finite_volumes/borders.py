@@ -15,6 +15,7 @@ from ..geometry.surfaces.sheets import Sheets
 from ..mesh.connectivity import distinct, following, rows_with, take_rows
 from ..mesh.diagram import Diagram
 from ..mesh.faces import Faces
+from ..mesh.geometry import sum_rows
 from .collapse import collapse_short
 from .moves import fewest_rejected, moved
 from .solid_walls.mend import NARROW, cells_of, narrow_faces, rejected_among, with_neighbors
@@ -231,7 +232,7 @@ def _with_pairs_only(mesh: Faces, rows: np.ndarray, small: np.ndarray, vertices:
             joined.append((i, j))
     group = connect(len(vertices), np.array(joined, int).reshape(-1, 2))[1]
     count = np.bincount(group)
-    x = np.stack([np.bincount(group, c) for c in mesh.points[vertices].T], axis=1) / count[:, None]
+    x = sum_rows(group, mesh.points[vertices], len(count)) / count[:, None]
     first = vertices[np.unique(group, return_index=True)[1]]
     points, to = mesh.points.copy(), np.arange(len(mesh.points))
     points[first], to[vertices] = x, first[group]

@@ -410,7 +410,7 @@ class PlaneMeasures:
         cell, p, q, origins = polygon_sides(mesh)
         twice = cross(p, q)
         self.areas = np.bincount(cell, twice, mesh.n_cells) / 2
-        moments = np.stack([np.bincount(cell, twice * sums, mesh.n_cells) for sums in (p + q).T], axis=1)
+        moments = sum_rows(cell, twice[:, None] * (p + q), mesh.n_cells)
         self.centroids = origins + moments / (6 * np.maximum(self.areas, _TINY**2))[:, None]
         self.inner = mesh.neighbor >= 0
         self.centers, self.vectors = mesh.vectors

@@ -59,10 +59,10 @@ class Polygon(Domain):
         is a ring: ``outer``, ``hole-1``, ``hole-2``, ..., or ``outer-1``, ``outer-2``, ... with several pieces, or a
         curve with a name. Edges that are not mentioned keep the name of their curve or ring.
     repair : bool
-        Take rings that cross themselves or each other, holes that overlap, and vertices twice or nearly so: what holes
-        share counts once, loops become rings of their own, and a domain that is cut in two has several pieces. A
-        warning says by how much the area changes. Edges get the name of the nearest given edge; `names` has numbers
-        then. Curves become polylines.
+        Accept rings that cross themselves or each other, holes that overlap, and repeated vertices. Such holes become
+        one, loops become rings of their own, and a domain that is cut in two has several pieces. A warning says by how
+        much the area changes. Each new edge has the name of the nearest given one; `names` may have only numbers of
+        edges. Curves become polylines.
 
     Attributes
     ----------

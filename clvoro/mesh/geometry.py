@@ -115,8 +115,8 @@ def pyramid_sums(
     Parameters
     ----------
     sides : callable
-        Returns of each face one component of its center, and of its outward area, (k,) each. So few columns of large
-        meshes are in memory.
+        Called with an axis. Returns that component of the centers of the faces, and of their outward areas, (k,) each.
+        One axis at a time takes less memory.
     cell : (k,) int
         The cell of each face.
     cells : int

@@ -16,6 +16,7 @@ from ...geometry.boundary_layers import DEEPER, INNER_DEPTH, OF_GAP, Layers
 from ...mesh.connectivity import distinct, following, rows_with, take_rows
 from ...mesh.diagram import Diagram
 from ...mesh.faces import Faces
+from ...mesh.geometry import sum_rows
 from ...mesh.results import thickness_in_words
 from ..gate import rejected_cells
 from .mesh import diagram_of
@@ -168,7 +169,7 @@ class _LayeredWalls:
         keys, pair = np.unique(self.corners * p + self.patch[self.face], return_inverse=True)
         pair = pair.reshape(-1)
         vector = self.faces.vectors[1][self.rows][self.face]
-        normal = np.stack([np.bincount(pair, vector[:, a], len(keys)) for a in range(3)], axis=1)
+        normal = sum_rows(pair, vector, len(keys))
         normal /= np.maximum(np.linalg.norm(normal, axis=1), 1e-300)[:, None]
         self.pair_vertex, self.pair_patch = keys // p, keys % p
         first = np.searchsorted(self.pair_vertex, np.arange(u + 1))
@@ -424,7 +425,7 @@ class _LayeredWalls:
         key = distinct(np.repeat(of, np.diff(begin)) * len(moved) + corners)
         cell, vertex = np.searchsorted(cells, key // len(moved)), key % len(moved)
         count = np.bincount(cell)
-        middle = np.stack([np.bincount(cell, f.points[vertex, a]) for a in range(3)], axis=1) / count[:, None]
+        middle = sum_rows(cell, f.points[vertex], len(count)) / count[:, None]
         x = f.points[vertex] - middle[cell]
         tensor = _sums(cell, x[:, :, None] * x[:, None, :])
         inverse = np.linalg.pinv(tensor, rcond=1e-6, hermitian=True)
