@@ -75,7 +75,7 @@ def check_shared(domain: Domain, options: Options, fixed: object) -> None:
     """Raise if ranks or devices cannot share such a run."""
     what = ""
     if not domain.may_have_parts:
-        what = f"domain is {domain!r:.80}, expected a Box without lines, holes or surfaces inside"
+        what = f"domain is {domain!r:.80}, expected a Sphere, or a Box without lines, holes or surfaces inside"
     elif options.method in ("transport", *MOVING):
         what = f"method is {options.method!r}, expected one other than {', '.join(map(repr, ('transport', *MOVING)))}"
     elif options.layers or fixed is not None:

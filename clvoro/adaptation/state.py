@@ -618,7 +618,7 @@ class MeshState:
         """
         with self.engine.workspace.frame():
             displacement = self.engine.scratch(self.points.shape)
-            count = self.stages.quality_descent.open_triangles(self.t, displacement)
+            count = int(self.engine.peers.total(self.stages.quality_descent.open_triangles(self.t, displacement)))
             if not count or count > MOST_OBTUSE * self.total:
                 return count, False
             self.zero_fixed(displacement)

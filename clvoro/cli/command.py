@@ -146,7 +146,7 @@ def _add_output(run: Any) -> None:
         default=(),
         help=f"further mesh files, such as openfoam,nc: {', '.join(MESH_FILES)}",
     )
-    _add_processors(run)
+    _add_processors(run, more="; for METIS: also write graph.info.part.N")
     run.add_argument(
         "--pieces",
         action="store_true",
@@ -193,9 +193,9 @@ def _add_walls(command: Any, more: str = "") -> None:
     )
 
 
-def _add_processors(command: Any) -> None:
+def _add_processors(command: Any, more: str = "") -> None:
     command.add_argument(
-        "--processors", metavar="N", type=int, help="for OpenFOAM: also write a case decomposed for N processors"
+        "--processors", metavar="N", type=int, help=f"for OpenFOAM: also write a case decomposed for N processors{more}"
     )
 
 
@@ -210,7 +210,7 @@ def _add_convert(commands: Any) -> None:
         "convert",
         help="write a mesh in another format",
         description="Read a mesh that clvoro wrote and write it in the format that the suffix of OUT names: "
-        ".vtu, .npz, .foam (or a folder polyMesh), .nc, .info (METIS), .vtk, .ply, .obj.",
+        ".vtu, .npz, .foam (or a folder polyMesh), .nc, .info (METIS), .info.part.N (its parts), .vtk, .ply, .obj.",
     )
     convert.set_defaults(work=_convert)
     convert.add_argument("mesh", metavar="MESH", help="mesh.npz, mesh.vtu, or mesh.nc on a sphere")

@@ -86,7 +86,7 @@ class Job:
     solver : "openfoam" or None
         Check the mesh by the criteria of this solver, and with its own program if that is installed.
     processors : int or None
-        Also write a decomposed case for OpenFOAM with this number of processors.
+        Also write a decomposed case for OpenFOAM, or the partition of `graph.info`, with this number of processors.
     peers : Peers
         The ranks that share the run under `mpiexec`. Each has the same job; rank 0 gathers the mesh and writes it.
     pieces : bool
@@ -176,9 +176,9 @@ class Job:
         settings = self.case.run_arguments()
         size = self._during("preparing the size field", self.case.size_field)
         warn_of_unused(self.case.run, [m or Options.method for m in self.case.methods])
+        self._land = self.case.land
         self._refuse_formats()
         self._refuse_pieces()
-        self._land = self.case.land
         self.case = self.case.with_patches(self.types)
         patch_types(self.case.domain.boundary_names, self.case.patches)
         state = self._state  # refuses what does not fit, before the folder is made
@@ -219,8 +219,8 @@ class Job:
                 )
         self.report = self.report and not self.pieces
         others = [kind for kind in self.mesh_formats if kind != "openfoam"]
-        if self.pieces and (others or self.solver is not None):
-            given = f"format {others[0]}" if others else "check-solver"
+        if self.pieces and (others or self.solver is not None or self._land is not None):
+            given = f"format {others[0]}" if others else "check-solver" if self.solver else "land"
             raise InputError(f"{given} needs the whole mesh, and pieces are given; leave --pieces out")
 
     def _run_one(self, adapter: Any, size: Any, method: str | None, settings: dict[str, Any]) -> Result:
@@ -264,7 +264,7 @@ class Job:
         self.interrupted = self.peers.any(self.interrupted or result.stop_reason == INTERRUPTED)
         if not self.pieces:
             result = result.gather() or result
-        if self._land is not None:
+        if self._land is not None and result.parts is None:
             result = result.subset(earth.ocean(result, self._land))
         return replace(result, stop_reason=INTERRUPTED) if self.interrupted else result
 
@@ -291,8 +291,8 @@ class Job:
             raise InputError(
                 f"walls is {self.walls!r}, and no mesh is written for OpenFOAM; add --format openfoam, or leave it out"
             )
-        if self.processors is not None and "openfoam" not in self.mesh_formats:
-            raise InputError("processors are given, and no mesh is written for OpenFOAM; add --format openfoam")
+        if self.processors is not None and not {"openfoam", "metis"} & set(self.mesh_formats):
+            raise InputError("processors are given, and nothing is written for them; add --format openfoam or metis")
         if self.types and "openfoam" not in self.mesh_formats:
             raise InputError("types are given, and no mesh is written for OpenFOAM; add --format openfoam")
         name, domain = self.case.name, self.case.domain
@@ -392,6 +392,8 @@ class Job:
             task = partial(write, main, self.out / name, **options)
             work = "solver mesh" if kind == "openfoam" else name
             tasks.append(partial(self._during, f"writing the {work}", task))
+            if kind == "metis" and self.processors:
+                tasks.append(partial(save, main, self.out / f"{name}.part.{self.processors}"))
         tasks += [partial(save, result, self.out / self._mesh_file_of(other)) for other, result in others]
         if self.peers.number:  # rank 0 writes all other files
             do_all(tasks)
@@ -526,6 +528,7 @@ class Job:
         places = "constant/polyMesh" + ", processor0, ..." * (self.pieces or self.processors is not None)
         for kind in self.mesh_formats:
             found.append(MESH_FILES[kind][0] + f" (with {places})" * (kind == "openfoam"))
+            found += [f"{MESH_FILES[kind][0]}.part.{self.processors}"] if kind == "metis" and self.processors else []
         found += [name for other in others for name in (self._mesh_file_of(other), f"history-{other}.csv")]
         found += ["case.toml", *self.case.copies()]
         return found + ["report.html", "pictures/"] * self.report

@@ -220,7 +220,15 @@ class Domain(ClipBox):
     @property
     def may_have_parts(self) -> bool:
         """Whether ranks can share a mesh of it."""
-        return not (self.curved or self.cuts_cells) and self.borders is None and self.wall_triangles is None
+        return not self.cuts_cells and self.borders is None and self.wall_triangles is None
+
+    @property
+    def landmarks(self) -> np.ndarray:
+        """Places (k, d) on all sides, without which cells of a part of a sphere would be unbounded; elsewhere none.
+
+        All parts of a mesh know the nearest generators.
+        """
+        return np.empty((0, self.dim))
 
     @property
     def globe(self) -> Sphere | None:

@@ -151,6 +151,11 @@ class Sphere(Domain):
         """The sphere itself."""
         return self
 
+    @cached_property
+    def landmarks(self) -> np.ndarray:
+        """The vertices of an icosahedron and the middles of its edges, (42, 3)."""
+        return self.icosahedral_points(1)
+
     @property
     def boundary_measure(self) -> float:
         """0: a sphere has no boundary."""

@@ -17,7 +17,7 @@ from ..mesh.results import Result
 from .atomic import check_writable, make_folder
 from .cgns import write_cgns
 from .contents import Contents
-from .convert import check_polygons, write_foreign, write_history, write_metis
+from .convert import check_polygons, write_foreign, write_history, write_metis, write_partition
 from .disv import Disv, DisvBoundary
 from .foam import write_foam
 from .npz import load as load_npz
@@ -28,8 +28,6 @@ from .vtu_read import load_vtu
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
-
-    from ..adaptation.gathering import ResultParts
 
 __all__ = ["Disv", "DisvBoundary", "check_writable", "load", "make_folder", "save", "write", "write_history"]
 
@@ -121,6 +119,7 @@ def write(
     contents = Contents.of(mesh, cell_data)
     path = Path(check_path("path", path))
     suffix = ".foam" if path.name == "polyMesh" else path.suffix.lower()
+    suffix = ".part" if Path(path.stem).suffix == ".part" and suffix[1:].isdecimal() else suffix
     if kind not in (None, suffix):
         ends = _ENDS[kind]
         raise InputError(f"cannot write {path} as {_KINDS[kind]}, expected a name that ends in {ends}; or use save")
@@ -132,25 +131,18 @@ def write(
                 f"cannot write {path} with {name}, which is for {' and '.join(_KINDS[of] for of in fits)}; save as "
                 f"{' or '.join(fits)} or leave it out"
             )
-    if suffix == ".foam" and contents.result is not None and contents.result.parts is not None:
-        _write_foam_of_ranks(contents.result, contents.result.parts, path, cell_data, given)
+    parts = None if contents.result is None else contents.result.parts
+    if contents.result is not None and parts is not None and suffix in _GATHERED:
+        if suffix == ".foam" or path.suffix == f".{parts.count}":
+            given = {"processors": parts.owners(), **given}
+        whole = parts.gather(contents.result)
+        parts.together(
+            lambda: None if whole is None else _WRITERS[suffix](Contents.of(whole, cell_data), path, **given)
+        )
         return
     if suffix != ".npz":
         contents.diagram.demand_cells(f"a {suffix} file")
     _WRITERS.get(suffix, write_foreign)(contents, path, **given)
-
-
-def _write_foam_of_ranks(
-    mesh: Result, parts: ResultParts, path: Path, cell_data: Mapping[str, ArrayLike] | None, given: dict[str, Any]
-) -> None:
-    """Gather the mesh on rank 0, which writes it as a decomposed case: a processor has the cells of a rank."""
-    whole, owners = parts.gather(mesh), parts.owners()
-
-    def write_whole() -> None:
-        if whole is not None:
-            write(whole, path, cell_data, **{"processors": owners, **given})
-
-    parts.together(write_whole)
 
 
 def _write_netcdf(contents: Contents, path: Path, convention: str = "ugrid", units: str = "m") -> None:
@@ -177,7 +169,10 @@ _WRITERS: dict[str, Callable[..., None]] = {
     ".nc": _write_netcdf,
     ".info": write_metis,
     ".graph": write_metis,
+    ".part": write_partition,
 }
+_GATHERED = (".foam", ".info", ".graph", ".part")
+"""What rank 0 writes for all ranks of MPI."""
 _KINDS = {".foam": "OpenFOAM", ".nc": "netCDF", ".vtu": ".vtu"}
 _ENDS = {".foam": ".foam, or the folder polyMesh of a case", ".nc": ".nc", ".vtu": ".vtu"}
 _METHODS = {".foam": "to_openfoam", ".nc": "to_netcdf", ".vtu": "to_vtu"}

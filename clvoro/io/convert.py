@@ -16,11 +16,13 @@ from ..geometry.domain import Domain, images_in
 from ..mesh.results import Result
 from .atomic import atomic_file, atomic_folder
 from .contents import Contents
+from .foam_parts import processors_of
 from .vtu import KINDS, cell_data, in_space, polyhedra
 
 if TYPE_CHECKING:
     import meshio
     import pyvista
+    from numpy.typing import ArrayLike
 
     from ..finite_volumes.solver_mesh import WallShape
     from ..mesh.diagram import Diagram
@@ -253,6 +255,23 @@ def write_metis(contents: Contents, path: Path) -> None:
             rows = starts[first : first + _CHUNK + 1]
             form = "".join(" ".join(["%d"] * k) + "\n" for k in np.diff(rows).tolist())
             file.write((form % tuple(neighbors[rows[0] : rows[-1]].tolist())).encode())
+
+
+def write_partition(contents: Contents, path: Path, processors: ArrayLike | None = None) -> None:
+    """Write the processor of each cell, a number per line: the file of METIS, as ``graph.info.part.8`` for 8 of them.
+
+    `processors` (n,) int are these; by default parts of equal numbers of cells, divided by planes.
+
+    Raises
+    ------
+    InputError
+        If there are data of the caller, or fewer cells than processors.
+    """
+    if contents.extra:
+        raise InputError(f"cannot write cell_data to {path}, which has the processor of each cell; leave it out")
+    part = processors_of(int(path.suffix[1:]) if processors is None else processors, contents.diagram.points)
+    with atomic_file(path) as file:
+        file.write(("%d\n" * len(part) % tuple(part.tolist())).encode())
 
 
 def write_history(result: Result, path: str | PathLike[str]) -> None:

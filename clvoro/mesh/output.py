@@ -145,8 +145,10 @@ class MeshOutput:
         ``.nc``
             Meshes in 2D and on spheres as netCDF by UGRID; `to_netcdf` has other conventions.
         ``.info``, ``.graph``
-            The neighbors of each cell as a graph for METIS, which divides it among the ranks of a parallel run; MPAS
-            reads the parts of ``graph.info``.
+            The neighbors of each cell as a graph for METIS, which divides it among the ranks of a parallel run.
+        ``.part.N``, as in ``graph.info.part.8``
+            The rank of each cell, as METIS writes it and MPAS reads it: N ranks have equal numbers of cells, divided by
+            planes. Over N ranks of MPI each has its own cells.
         ``.vtk``, ``.ply``, ``.obj``
             Meshes in 2D and on spheres, written by meshio (``pip install "clvoro[formats]"``); the latter two without
             cell data. Cells are sorted by their number of corners; in ``.vtk`` the cell data `label` is the row in the

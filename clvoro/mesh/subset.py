@@ -167,7 +167,7 @@ def _arrays(d: Diagram, kept: np.ndarray, faces: np.ndarray, neighbors: np.ndarr
 _CORNERS = {"cell_vertex": "cell_vertices", "face_vertex": "face_vertices"}
 
 
-def _on_sphere(d: Diagram, kept: np.ndarray, boundary: str, sphere: Sphere) -> Diagram:
+def _on_sphere(d: Diagram, kept: np.ndarray, boundary: str | np.ndarray, sphere: Sphere) -> Diagram:
     """Return the kept cells; faces towards removed cells become faces on the boundary."""
     number = np.cumsum(kept) - 1
     owner = d.half_faces.owner
@@ -181,7 +181,7 @@ def _on_sphere(d: Diagram, kept: np.ndarray, boundary: str, sphere: Sphere) -> D
         np.where(lost, -1 - len(former) - np.searchsorted(removed, behind), number[np.maximum(behind, 0)]),
     )
     labels = [sphere.boundary_names[k] for k in sphere.boundary_index[former]]
-    labels += [boundary] * len(removed)
+    labels += np.broadcast_to(np.asarray(boundary, object), len(d))[removed].tolist()
     beyond = [d.points[removed]]
     if len(former):
         beyond.insert(0, sphere.mirrored(former, d.points[:0]))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar, cast
@@ -27,7 +28,8 @@ that sleeps delays each of them."""
 ALARM, CLOSE, CLOSED = 1, 2, 3
 """Tags of messages: a rank has failed, rank 0 sends the exit code, another rank has received it."""
 GRACE = 1.0
-"""Seconds for which rank 0 waits for answers to the exit code. The others wait 1.5 times as long for the code."""
+"""Seconds for which rank 0 waits for answers to the exit code, where each process has a core. The others wait 1.5 times
+as long for the code."""
 
 
 class Swap(NamedTuple):
@@ -290,8 +292,12 @@ class Ranks(Peers):
         self._comm.Abort(code)
 
     def _hear(self, part: int, tag: int, seconds: float) -> int | None:
-        """Return the number that `part` sends, or None if it does not send one in time."""
-        latest = time.monotonic() + seconds
+        """Return the number that `part` sends, or None if it does not send one in time.
+
+        Where more processes work than there are cores, they get more time.
+        """
+        load = os.getloadavg()[0] if hasattr(os, "getloadavg") else 0.0
+        latest = time.monotonic() + seconds * max(load / (os.cpu_count() or 1), 1)
         while not self._alarms.Iprobe(part, tag):
             if time.monotonic() > latest:
                 return None

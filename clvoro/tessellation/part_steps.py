@@ -69,8 +69,8 @@ class Chunks:
     Parameters
     ----------
     points : (n, d) float
-    lower, upper : (d,) float
-        Corners of a box with all of them.
+    least : float
+        Least spacing.
 
     Attributes
     ----------
@@ -82,11 +82,11 @@ class Chunks:
         successive ones; the estimate is the largest of three runs, that of the generator and the two beside it.
     """
 
-    def __init__(self, points: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> None:
+    def __init__(self, points: np.ndarray, least: float) -> None:
         n = len(points)
         ways = np.linalg.norm(np.diff(points, axis=0), axis=1)
         runs = np.arange(max(n // RUN, 1)) * RUN
-        usual = np.full(len(runs), float(np.prod(upper - lower) / n) ** (1 / len(lower)) / 16)
+        usual = np.full(len(runs), least)
         if n >= 2 * RUN:
             usual = np.maximum(usual, np.median(ways[runs[:, None] + np.arange(RUN - 1)], axis=1))
         usual = np.maximum(usual, np.maximum(np.append(usual[1:], usual[-1]), np.append(usual[0], usual[:-1])))
@@ -267,6 +267,7 @@ class PartSteps(DomainSteps):
         self._corners = [corner[: domain.dim].astype(float) for corner in domain.device_corners(real)]
         if self.is_periodic:
             self.box = ExtendedBox(self._corners[0] - periods, self._corners[1] + periods)
+        self._measure = domain.measure / domain.frame[1] ** domain.cell_dim
         self._room = NamedArrays(stages.engine, spare=1 / 16)
         self._labels: cla.Array | None = None
 
@@ -313,14 +314,33 @@ class PartSteps(DomainSteps):
 
     def _begin_anew(self, x: np.ndarray, labels: cla.Array) -> None:
         """Ask for the ghosts of new generators."""
-        self._labels, self._chunks = labels, Chunks(x, *self._corners)
+        least = (self._measure / max(len(x), 1)) ** (1 / self.domain.cell_dim) / 16
+        self._labels, self._chunks = labels, Chunks(x, least)
         self._sent = [np.empty(0, np.int32) for _ in range(self.peers.count * len(self._shifts))]
         self._sides, self._rows = np.empty(0, int), np.empty(0, np.int32)
+        self._share_landmarks(x)
         self._caps = FIRST_REACH[self._reads_rows] * self._chunks.spacings
         answers = self._ask(x, self._caps, self._caps)
         self._take(answers)
         self._limit(answers)
         self._store()
+
+    def _share_landmarks(self, x: np.ndarray) -> None:
+        """Give the generators nearest to the landmarks of the domain to all parts; own ones are at `x` (n, d)."""
+        squares, places = (x * x).sum(axis=1), self.domain.place(self.domain.landmarks, self.stages.engine.real)
+        nearest = np.array([(np.inf, 0.0)] * len(places)).reshape(-1, 2)
+        for k, place in enumerate(places if len(x) else ()):
+            ways2 = squares - 2 * (x @ place)
+            nearest[k] = ways2.min(), ways2.argmin()
+        found = np.array(self.peers.gather(nearest)) if len(places) else np.empty((self.peers.count, 0, 2))
+        owners = found[:, :, 0].argmin(axis=0)
+        for number in np.unique(owners):
+            rows = np.unique(found[number, owners == number, 1]).astype(np.int32)
+            if number == self.peers.number:
+                self._sent = [known if k == number else rows for k, known in enumerate(self._sent)]
+            else:
+                self._sides = np.concatenate([self._sides, np.full(len(rows), number)])
+                self._rows = np.concatenate([self._rows, rows])
 
     def _store(self) -> None:
         """Upload the lists of ghosts, and get their labels from their owners."""
@@ -415,8 +435,7 @@ class PartSteps(DomainSteps):
 
     def _check(self, volume: float, gap: float, faces: float) -> None:
         """Raise if the cells of all parts do not fill the domain, or a face between two parts has only one side."""
-        real, (lower, upper) = self.stages.engine.real, self._corners
-        off = abs(volume / float(np.prod(upper - lower)) - 1)
+        real, off = self.stages.engine.real, abs(volume / self._measure - 1)
         if off > FILLED[real.name] or abs(gap) > MATCHED[real.name] * faces:
             raise ClvoroError(
                 f"the cells of all ranks differ from the domain by {off:.2g} of its volume, and faces between them by "

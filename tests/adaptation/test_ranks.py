@@ -39,7 +39,10 @@ from clvoro.opencl.threads import Team
 from clvoro.tessellation import part_steps
 from clvoro.tessellation.part_steps import PartSteps
 
-ARRAYS = ("points", "volumes", "centroids", "neighbor_starts", "neighbors", "face_measures", "face_centroids")
+ARRAYS = (
+    *("points", "volumes", "centroids", "neighbor_starts", "neighbors", "face_measures", "face_centroids"),
+    "vertices",
+)
 SCRIPT = """
 import os, resource, sys
 import clvoro, numpy as np
@@ -102,13 +105,13 @@ max_steps = 2
 
 
 def run_in(parts, ctx, *given, dtype="float64", path=None, **options):
-    """Return the results of `parts` threads, each with an adapter, and the whole mesh; save them to `path`."""
+    """Return the results of `parts` threads, each with an adapter, and the whole mesh; save them in `path`."""
 
     def work(peers):
         mesh = clvoro.Adapter(ctx, dtype, peers).run(*given, **options)
-        if path is not None:
-            mesh.save(path)
-            mesh.save(path.with_name("case") / "case.foam")
+        for name in () if path is None else ("mesh.pvtu", "graph.info", f"graph.info.part.{parts}", "case/case.foam"):
+            if name[:4] != "case" or not given[0].curved:
+                mesh.save(path / name)
         return mesh, mesh.gather()
 
     found = Team(parts).run(work)
@@ -117,21 +120,25 @@ def run_in(parts, ctx, *given, dtype="float64", path=None, **options):
 
 
 def ramp(h):
-    return lambda p: h * (1 + 2 * p[:, 0])
+    return lambda p: h * (1 + 2 * np.abs(p[:, 0]))
 
 
 @pytest.mark.sparse(3)
-@pytest.mark.parametrize("periodic", [False, True])
+@pytest.mark.parametrize("kind", ["walls", "periodic", "sphere"])
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
 @pytest.mark.parametrize("dim", [2, 3])
-def test_the_diagram_has_the_same_bits_in_any_number_of_parts(ctx, dim, dtype, periodic):
+def test_the_diagram_has_the_same_bits_in_any_number_of_parts(ctx, dim, dtype, kind):
     """Clusters of very different density, so that balls reach far: ghosts are enough, or bits differ.
 
-    The whole of a periodic box is made anew from the generators, but its errors and qualities come from the parts.
+    The whole of a periodic box is made anew from the generators, but its errors and qualities come from the parts. On a
+    sphere most parts have generators on one side only.
     """
-    rng = np.random.default_rng(70101)
+    rng, periodic = np.random.default_rng(70101), kind == "periodic"
+    dim = 3 if kind == "sphere" else dim
     x = np.concatenate([rng.random((150, dim)), (0.3 + 0.02 * rng.standard_normal((150, dim))) % 1])
-    given = clvoro.Box((0,) * dim, (1,) * dim, periodic=(periodic, periodic, False)[:dim]), 0.1
+    box = clvoro.Box((0,) * dim, (1,) * dim, periodic=(periodic, periodic, False)[:dim])
+    given = clvoro.Sphere(2) if kind == "sphere" else box, 0.1
+    x[:150] -= 0.5 if kind == "sphere" else 0
     options = {"points": x.astype(dtype), "method": "lloyd", "max_steps": 0, "dtype": dtype}
     meshes = [run_in(parts, ctx, *given, **options)[1] for parts in (1, 2, 4)]
     plain = clvoro.Adapter(ctx, dtype).diagram(given[0], options["points"])
@@ -171,7 +178,7 @@ def test_a_run_in_parts_of_a_periodic_box(ctx, tmp_path):
     short, state = {"effort": "fast", "max_steps": 20}, tmp_path / "state"
     run_in(2, ctx, *given, **short, checkpoint=state, callback=lambda row: row["step"] == 12)
     again = clvoro.Checkpoint(resume=state)
-    meshes, whole = run_in(3, ctx, *given, **short, path=tmp_path / "mesh.pvtu", checkpoint=again)
+    meshes, whole = run_in(3, ctx, *given, **short, path=tmp_path, checkpoint=again)
     assert whole.check()
     assert whole.history["step"][-1] == 20
     assert whole.history["mean_quality"][-1] > 0.9
@@ -186,15 +193,17 @@ def test_a_run_in_parts_of_a_periodic_box(ctx, tmp_path):
     ].check()
 
 
-@pytest.mark.parametrize("dim", [2, 3])
-def test_a_run_in_parts(ctx, dim, tmp_path):
+@pytest.mark.parametrize("kind", ["plane", "space", "sphere"])
+def test_a_run_in_parts(ctx, kind, tmp_path):
     """Each part has its own cells, in balance; the whole has the sizes and shapes of a run without parts.
 
     ParaView's library reads the pieces of all parts as one mesh.
     """
-    given = clvoro.Box((0,) * dim, (1,) * dim), ramp(0.05 if dim == 2 else 0.1)
+    dim = 2 if kind == "plane" else 3
+    domain = clvoro.Sphere(0.5) if kind == "sphere" else clvoro.Box((0,) * dim, (1,) * dim)
+    given = domain, ramp({"plane": 0.05, "space": 0.1, "sphere": 0.1}[kind])
     alone = clvoro.Adapter(ctx).run(*given, effort="fast")
-    meshes, whole = run_in(3, ctx, *given, effort="fast", path=tmp_path / "mesh.pvtu")
+    meshes, whole = run_in(3, ctx, *given, effort="fast", path=tmp_path)
     assert whole.check()
     if dim == 3:
         again = clvoro.Adapter(devices=[ctx] * 3, share_gpus=True).run(*given, effort="fast")
@@ -208,7 +217,9 @@ def test_a_run_in_parts(ctx, dim, tmp_path):
     for name in ("mean_error", "mean_quality"):
         one, other = alone.history[name][-1], whole.history[name][-1]
         assert abs(one - other) < (0.3 * one if name == "mean_error" else 0.01)
-    labels = np.sort(np.concatenate([mesh.parts.labels for mesh in meshes]))
+    assert kind != "sphere" or whole.measures.c_grid.obtuse == 0
+    labels_by_part = np.concatenate([mesh.parts.labels for mesh in meshes])
+    labels = np.sort(labels_by_part)
     assert (np.diff(labels) > 0).all()
     for number, mesh in enumerate(meshes):
         names = set(mesh.domain.boundary_names)
@@ -218,14 +229,17 @@ def test_a_run_in_parts(ctx, dim, tmp_path):
         for array in ("points", "volumes", "size_error", "quality"):
             assert np.array_equal(getattr(mesh, array), getattr(whole, array)[rows])
 
-    for number, size in enumerate(sizes):
+    owners = np.loadtxt(tmp_path / "graph.info.part.3", int)
+    assert np.array_equal(owners, np.repeat(range(3), sizes)[np.argsort(labels_by_part, kind="stable")])
+    assert (tmp_path / "graph.info").read_text().split()[:2] == [str(len(whole)), str(whole.faces.n_inner)]
+    for number, size in enumerate(sizes if kind != "sphere" else ()):
         cells = tmp_path / f"case/processor{number}/constant/polyMesh/cellProcAddressing"
         assert f"\n{size}\n(" in cells.read_text()
 
     pyvista = pytest.importorskip("pyvista")
     read = pyvista.read(tmp_path / "mesh.pvtu")
     assert read.n_cells == len(whole)
-    assert np.isclose(read.cell_data["volume"].sum(), 1)
+    assert np.isclose(read.cell_data["volume"].sum(), domain.measure)
     assert np.array_equal(read.cell_data["error"], np.concatenate([mesh.size_error for mesh in meshes]))
 
 
@@ -447,11 +461,12 @@ def test_what_the_command_refuses_over_ranks(tmp_path, monkeypatch):
     ranks.count = 2
     with pytest.raises(InputError, match="one process has the whole mesh"):
         Job(case, tmp_path, pieces=True)._refuse_pieces()
-    for changed in ({"mesh_formats": ("vtk",)}, {"solver": "openfoam"}):
+    for changed in ({"mesh_formats": ("vtk",)}, {"solver": "openfoam"}, {}):
+        monkeypatch.setattr(Job, "_land", None if changed else "land.geojson", raising=False)
         with pytest.raises(InputError, match="needs the whole mesh, and pieces"):
             Job(case, tmp_path, pieces=True, peers=ranks, **changed)._refuse_pieces()
         Job(case, tmp_path, peers=ranks, **changed)._refuse_pieces()
-    with pytest.raises(InputError, match="processors are given, and no mesh"):
+    with pytest.raises(InputError, match="processors are given, and nothing"):
         Job(case, tmp_path, processors=2)._refuse_formats()
     Job(case, tmp_path, processors=2, mesh_formats=("openfoam",))._refuse_formats()
     for changed, what in ((load_case("spots"), None), "32 frames"), ((case, "0:0,0:1"), "2 devices"):
@@ -461,6 +476,7 @@ def test_what_the_command_refuses_over_ranks(tmp_path, monkeypatch):
     monkeypatch.setenv("PMI_SIZE", "2")
     mpi4py = types.ModuleType("mpi4py")
     monkeypatch.setitem(sys.modules, "mpi4py", mpi4py)
+    monkeypatch.delitem(sys.modules, "mpi4py.MPI", raising=False)  # FiPy loads it
     with pytest.raises(MissingLibraryError, match="call clvoro without mpiexec"):
         this_rank()
     alone = types.SimpleNamespace(Get_rank=lambda: 0, Get_size=lambda: 1, Iallgather=None)

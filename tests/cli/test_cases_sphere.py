@@ -214,7 +214,7 @@ def test_ocean_is_what_it_says():
 
 @pytest.mark.slow
 def test_run_writes_everything(here, capsys):
-    options = ("--cells", 500, "--effort", "fast", "--json", "--format", "nc,mpas,metis")
+    options = ("--cells", 500, "--effort", "fast", "--json", "--format", "nc,mpas,metis", "--processors", 3)
     assert call("run", "ocean", *options) == cli.OK
     out = here / "out" / "ocean"
     result = load(out / "mesh.npz")
@@ -222,7 +222,15 @@ def test_run_writes_everything(here, capsys):
     assert (len(result.points), result.diagram.domain) == (500, clvoro.Sphere())
     assert json.loads(capsys.readouterr().out)["cells"] == 500
     written = {p.name for p in out.iterdir()}
-    assert {"mesh.vtu", "mesh.nc", "mesh-mpas.nc", "graph.info", "case.toml", "report.html"} <= written
+    assert {
+        "mesh.vtu",
+        "mesh.nc",
+        "mesh-mpas.nc",
+        "graph.info",
+        "graph.info.part.3",
+        "case.toml",
+        "report.html",
+    } <= written
     pictures = {p.stem for p in (out / "pictures").iterdir()}
     assert {"size", "plate", "cells", "history", "sides"} <= pictures
     with netcdf_file(out / "mesh-mpas.nc", mmap=False) as file:

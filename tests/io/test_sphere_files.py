@@ -175,6 +175,15 @@ def test_graph_for_metis_has_the_neighbors(result, tmp_path):
     d = result.diagram
     assert (n, 2 * edges) == (len(d), len(d.neighbors))
     assert rows == [sorted(row.tolist()) for row in np.split(d.neighbors, d.neighbor_starts[1:-1])]
+    result.save(tmp_path / "graph.info.part.7")
+    part = np.loadtxt(tmp_path / "graph.info.part.7", int)
+    assert np.ptp(np.bincount(part, minlength=7)) <= 1
+    cut = sum(part[i] < part[j] for i, row in enumerate(rows) for j in row)
+    assert cut < 5 * 7**0.5 * n**0.5
+    with pytest.raises(InputError, match="expected 1 to"):
+        result.save(tmp_path / f"graph.info.part.{n + 1}")
+    with pytest.raises(InputError, match="cell_data"):
+        result.save(tmp_path / "graph.info.part.2", cell_data={"mine": np.zeros(n)})
 
 
 def test_graph_for_metis_in_other_domains(ctx, tmp_path):

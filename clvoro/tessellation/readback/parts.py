@@ -12,7 +12,7 @@ from ...geometry.domain import Domain
 from ...mesh.diagram import Diagram
 from ...mesh.subset import take_subset
 from ...opencl.engine import Engine
-from ...opencl.peers import Peers
+from ...opencl.peers import ALONE, Peers
 from ..device_diagram import Tessellation
 from ..stages import TessellationStages
 from ..tessellator import Tessellator
@@ -21,8 +21,8 @@ from .diagram import fetch_diagram, order_of, starts_of
 
 def fetch_part(engine: Engine, domain: Domain, t: Tessellation, labels: cla.Array, held: int = 0) -> Diagram:
     """Return the cells of a part in the order of `labels` (n,). Faces towards cells of part k are walls ``"rankK"``."""
-    if t.part is not None and t.part.peers is not None and t.part.peers.count == 1:
-        rows = CellRows.of(t, labels).gather(t.part.peers)
+    if t.part is not None and (t.part.peers or ALONE).count == 1:
+        rows = CellRows.of(t, labels).gather(ALONE)
         assert rows is not None
         return rows.diagram(engine, domain)
     if t.part is None or t.part.ghosts is None or t.whole is None:
