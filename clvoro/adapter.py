@@ -20,11 +20,12 @@ from .adaptation.options import (
     MethodName,
     MultilevelOptions,
     PaperOptions,
+    RunArguments,
     Start,
-    merged_options,
+    check_callback,
 )
 from .adaptation.preparation import prepare
-from .adaptation.run import INTERRUPTED, Run, RunArguments, check_run, check_shared
+from .adaptation.run import INTERRUPTED, Run, check_shared
 from .adaptation.stages import Stages
 from .adaptation.transport import RELAXED, power_diagram_of, transport_to
 from .arguments import check_choice, check_integer, check_points, coincident_named
@@ -528,12 +529,12 @@ class Adapter:
         (True, True)
         """
         given = {"effort": effort, "seed": seed, "max_steps": max_steps, "n_cells": n_cells, "layers": layers}
-        merged, own = merged_options(points, options, method=method, **given)
+        arguments = RunArguments.of(domain, size, points, options, fixed, checkpoint, method=method, **given)
         check_choice("on_interrupt", on_interrupt, ("raise", "return"))
-        check_run(domain, size, callback)
+        check_callback(callback)
         with self._alone():
             run = self._run_together if self._others else self._run
-            return run(RunArguments(domain, size, own, fixed, merged, checkpoint), callback, on_interrupt)
+            return run(arguments, callback, on_interrupt)
 
     def _run(
         self,
@@ -631,8 +632,7 @@ class Adapter:
         True
         """
         given = {"effort": effort, "seed": seed, "max_steps": max_steps, "n_cells": n_cells, "layers": layers}
-        merged, own = merged_options(points, options, method=method, **given)
-        check_run(domain, size, None)
+        arguments = RunArguments.of(domain, size, points, options, fixed, checkpoint, method=method, **given)
         if self._peers.shared:
             raise InputError(
                 "start is called with an Adapter that has comm or devices, expected run: they share whole runs"
@@ -640,7 +640,6 @@ class Adapter:
         stages = Stages(self._engine_for(domain))
         with self._at_work(stages):
             shown = self._shown(None, None)
-            arguments = RunArguments(domain, size, own, fixed, merged, checkpoint)
             return Run(stages, arguments, shown, self.on_memory, self._at_work)
 
     @contextmanager
@@ -686,8 +685,7 @@ class Adapter:
         >>> 5e6 < bytes_ < 7e6
         True
         """
-        merged, own = merged_options(points, options, method=method, n_cells=n_cells, layers=layers)
+        arguments = RunArguments.of(domain, size, points, options, method=method, n_cells=n_cells, layers=layers)
         with self._alone():
             stages = self._stages_for(domain, self._peers)
-            host = None if own is None else check_points(own, domain)
-            return prepare(stages, domain, size, host, merged).memory
+            return prepare(stages, arguments.checked(self.dtype)).memory

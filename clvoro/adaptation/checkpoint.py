@@ -21,7 +21,7 @@ import time
 from collections.abc import Sequence
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
 
@@ -32,14 +32,16 @@ from ..mesh.results import HISTORY_DTYPE, Displacements
 from ..opencl.peers import ALONE, Peers
 from ..tessellation.decomposition import distribute
 from .insertion_deletion import Generators
+from .options import RunArguments
 from .plan.actions import Action, Step
-from .preparation import GivenPoints
+from .plan.schedule import Begins
+from .preparation import Beginning
 from .state import Arrays, MeshState, Setup
 
 if TYPE_CHECKING:
     from .run import Run
 
-FORMAT, PIECE, VERSION = "clvoro-checkpoint", "clvoro-checkpoint-piece", 11
+FORMAT, PIECE, VERSION = "clvoro-checkpoint", "clvoro-checkpoint-piece", 12
 _GENERATORS = tuple(field.name for field in dataclasses.fields(Generators))
 _OTHERS = ("potential", "multipliers", "weights")
 _COUNTS = ("position", "level", "levels", "n_start", "started", "steps", "next_label", "pace")
@@ -104,7 +106,7 @@ class Checkpointer:
             "position": run.position,
             "level": run.level,
             "levels": run.levels,
-            "given": run.given,
+            "beginning": run.beginning,
             "n_start": run.n_start,
             "started": run.started,
             "steps": run.steps,
@@ -163,8 +165,8 @@ class Saved:
     ----------
     levels : int
         Number of coarser levels of the run.
-    given : GivenPoints
-        How the run uses the points that the caller has given.
+    beginning : Beginning
+        What the run began with.
 
     Raises
     ------
@@ -192,8 +194,10 @@ class Saved:
             self.size_factor = float.fromhex(state["size_factor"])
             self.elapsed = float(state["elapsed"])
             self._take_rows([(str(name), int(count)) for name, count in about.get("pieces", [])])
-            near, replaced, why = state["given"]
-            self.levels, self.given = int(state["levels"]), GivenPoints(bool(near), bool(replaced), str(why))
+            begins, why = state["beginning"]
+            self.levels, self.beginning = int(state["levels"]), Beginning(begins, str(why))
+            if begins not in get_args(Begins):
+                raise ValueError("beginning")
             if not (0 < self.size_factor < np.inf and 0 <= self.elapsed < np.inf and state["level"] <= self.levels):
                 raise ValueError("size_factor")
             self._check(len(self.fingerprint["domain"]["lower"]), np.dtype(self.fingerprint["dtype"]))
@@ -359,17 +363,16 @@ class Saved:
         return Displacements(*saved)  # type: ignore[arg-type]
 
 
-def run_fingerprint(
-    domain: Domain, options: dict[str, Any], dtype: np.dtype, points: np.ndarray | None, fixed: np.ndarray | None = None
-) -> dict[str, Any]:
-    """Return plain values that identify a run. A checkpoint of another run is rejected."""
+def run_fingerprint(arguments: RunArguments, dtype: np.dtype) -> dict[str, Any]:
+    """Return plain values that identify a run with these checked `arguments`. A checkpoint of another is rejected."""
+    domain, _, options, points, fixed, _ = arguments
     return {
         "domain": domain_fingerprint(domain),
         "dtype": dtype.name,
         "points": None if points is None else _digest(points),
-        "fixed": _digest(fixed) if fixed is not None and len(fixed) else None,
-        **options,
-        "layers": [repr(layer) for layer in options["layers"]],
+        "fixed": _digest(fixed) if len(fixed) else None,
+        **vars(options),
+        "layers": [repr(layer) for layer in options.layers],
     }
 
 

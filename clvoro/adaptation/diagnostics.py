@@ -3,29 +3,19 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import numpy as np
 
 from ..arguments import format_point, warn
 from ..errors import InputError, MismatchWarning, ObtuseTrianglesWarning, PrecisionWarning, SizeErrorWarning
-from ..geometry.boundary_layers import Layers, columns_of, sample_walls
 from ..geometry.domain import Domain
 from ..mesh.diagram import Diagram
 from ..mesh.results import Result
 from ..sizing import Sizing
-from ..sizing.field import Field
 
-COARSER, FINER = 2.0, 1e-3
-"""Ratios of the sizes of layers and of the field beside them that indicate a mistake."""
-THICKEST, FLATTEST, THINNEST = 3.0, 1000.0, 0.02
-"""Limits of layers of prisms: all together and the first one over the size field, and the last one over it."""
-NARROWER = 0.8
-"""Width of layers over the size field below which a run says so."""
 MOVED = 1e-3
 """Way of a fixed generator over h above which a run says so."""
-SAMPLE = 64
-"""Points along a layer where the sizes are compared."""
 MISSED = 0.2
 """Mean |e| above which a run has not met its sizes."""
 FAR_ERROR = 10.0
@@ -45,25 +35,6 @@ SHORTEST_EDGE, MAX_EDGE_ERROR = 0.13, 1e-4
 run warns. The spacing of positions over the shortest edge is about the largest error (`bench/sphere.py --single`)."""
 MAX_SPACING = 1 / 16
 """Spacing of positions over the smallest h above which a run warns: random starts have pairs much closer than h."""
-
-
-def warn_of_mismatches(field: Field, domain: Domain, layers: Sequence[Layers]) -> None:
-    """Warn of parts of the input that do not match `domain`, and of layers that do not match `field`.
-
-    Parameters
-    ----------
-    field : Field
-        The field of the caller, without the limits beside layers.
-
-    Warns
-    -----
-    MismatchWarning
-    """
-    found = domain.warnings() + field.warnings(domain)
-    for k, layer in enumerate(layers):
-        found += layer_mismatches(f"layers[{k}]", layer, field, domain)
-    for text in found:
-        warn(text, MismatchWarning)
 
 
 def warn_of_narrow_parts(domain: Domain, size: Callable[[np.ndarray], np.ndarray]) -> None:
@@ -89,74 +60,6 @@ def warn_of_narrow_parts(domain: Domain, size: Callable[[np.ndarray], np.ndarray
     else:
         text = f"the domain has a dead end that is narrower than a cell: {here}cells there have poor shapes"
     warn(f"{text}. {domain.remedy_for_narrow_parts}", MismatchWarning)
-
-
-def widths_of_layers(field: Field, domain: Domain, layers: Sequence[Layers]) -> str:
-    """Return in words where the default width of layers is smaller than the size field, or an empty text."""
-    found = []
-    for k, layer in enumerate(layers):
-        if layer.spacing is None and not domain.extrudes_layers:
-            feet, normals = columns_of(domain, layer)
-            places = (feet + layer.rows[-1] * normals)[:: -(-len(feet) // SAMPLE)]
-            places = places[domain.contains(places)]
-            h = float(np.median(field(places))) if len(places) else 0.0
-            if layer.width < NARROWER * h:
-                found.append(
-                    f"layers[{k}] have cells {layer.width:.3g} wide, the last layer's height, where the size field is "
-                    f"{h:.3g}: give spacing for others"
-                )
-    return "; ".join(found)
-
-
-def layer_mismatches(name: str, layer: Layers, field: Field, domain: Domain) -> list[str]:
-    """Return warnings if the cells of `layer` have a very different size than `field` there.
-
-    Layers are usually finer than the field across the wall. But their width along the wall, if it is not given, can be
-    far too small.
-    """
-    if domain.extrudes_layers:
-        return _prism_mismatches(name, layer, field, domain)
-    feet, normals = columns_of(domain, layer)
-    some = slice(None, None, -(-len(feet) // SAMPLE))
-    for row in sorted({0, layer.count - 1}):
-        places = (feet + layer.rows[row] * normals)[some]
-        places = places[domain.contains(places)]
-        if not len(places):
-            continue
-        h, height = float(np.median(field(places))), float(layer.heights[row])
-        what = f"{name} has cells {layer.width:.3g} wide and {height:.3g} high where the size field is {h:.3g}"
-        if math.sqrt(layer.width * height) > COARSER * h:
-            remedy = "make the layers finer or the size field larger along these walls"
-            return [f"{what}: sizes jump there; {remedy}"]
-        if row == layer.count - 1 and layer.spacing is None and layer.width < FINER * h:
-            return [
-                f"{what}: their width is the last layer's height, because no spacing is given; do layers and size "
-                "field have the same unit? Otherwise give spacing, the width along the wall"
-            ]
-    return []
-
-
-def _prism_mismatches(name: str, layer: Layers, field: Field, domain: Domain) -> list[str]:
-    """Return warnings if prisms are far thicker or thinner than the cells beside them."""
-    _, h = sample_walls(domain, layer, field, SAMPLE)
-    smallest, largest = float(h.min()), float(h.max())
-    if layer.thickness > THICKEST * smallest:
-        return [
-            f"{name} are {layer.thickness:.3g} thick where the size field is {smallest:.3g}, expected at most "
-            f"{THICKEST:g} times as much, as all cells beside them are compressed; use fewer or thinner layers"
-        ]
-    if largest > FLATTEST * layer.height:
-        return [
-            f"{name} have a first height of {layer.height:.3g} where the size field is {largest:.3g}: OpenFOAM's "
-            f"checkMesh rejects cells more than {FLATTEST:g} times as wide as high; use a larger height, or smaller "
-            "sizes there"
-        ]
-    if layer.heights[-1] < THINNEST * smallest:
-        return [
-            f"the last of {name} is {layer.heights[-1]:.3g} high beside cells of {smallest:.3g}, where sizes jump; use "
-            "more layers, or a larger growth"
-        ]
-    return []
 
 
 def warn_of_moved_points(fixed: np.ndarray, diagram: Diagram, sizes: np.ndarray) -> None:

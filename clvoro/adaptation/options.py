@@ -8,13 +8,15 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import partial
 from numbers import Real
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
 
 import numpy as np
 
-from ..arguments import check_choice, check_integer, check_number, check_path, warn
+from ..arguments import check_callable, check_choice, check_integer, check_number, check_path, check_points, warn
 from ..errors import InputError, InputTypeError, UnusedOptionWarning
 from ..geometry.boundary_layers import Layers
+from ..geometry.domain import Domain
+from .fixed_points import check_fixed
 from .methods import MOVING, PUBLISHED
 
 if TYPE_CHECKING:
@@ -275,22 +277,77 @@ class Options:
         return self.method in _MULTILEVEL
 
 
-def merged_options(points: ArrayLike | Start, options: object, **given: Any) -> tuple[Options, ArrayLike | None]:
-    """Return all options of `Adapter.run` in one place, and the caller's generators if `points` are not random.
+class RunArguments(NamedTuple):
+    """Arguments of `Adapter.run`."""
+
+    domain: Domain
+    size: object
+    options: Options
+    points: Any = None
+    """Generators of the caller, if they are not random."""
+    fixed: Any = None
+    checkpoint: Any = None
+
+    @classmethod
+    def of(
+        cls,
+        domain: Domain,
+        size: object,
+        points: ArrayLike | Start,
+        options: object,
+        fixed: object = None,
+        checkpoint: object = None,
+        **given: Any,
+    ) -> RunArguments:
+        """Merge all options, and check what does not need the domain.
+
+        Raises
+        ------
+        InputError, InputTypeError
+            If a value is not as expected.
+        """
+        if options is not None and not isinstance(options, MultilevelOptions | PaperOptions):
+            raise InputTypeError(
+                f"options is {options!r:.60} of type {type(options).__name__}, expected clvoro.MultilevelOptions "
+                "(methods adaptive, exact, transport) or clvoro.PaperOptions (the other methods)"
+            )
+        start, own = (points, None) if isinstance(points, str) else ("density", points)
+        special = {} if options is None else vars(options)
+        merged = Options(start=start, **given, **special)
+        if isinstance(size, Domain) and not isinstance(domain, Domain):
+            raise InputTypeError(
+                f"size is the domain {size!r}, and domain is a {type(domain).__name__}; exchange them: run(domain, "
+                "size)"
+            )
+        return cls(domain, size, merged, own, fixed, checkpoint)
+
+    def checked(self, real: np.dtype) -> RunArguments:
+        """Return the same with arrays in place of `points` and `fixed`, and a `Checkpoint`.
+
+        Raises
+        ------
+        InputError, InputTypeError
+            If generators are not distinct positions inside the domain.
+        """
+        files = self.checkpoint if isinstance(self.checkpoint, Checkpoint) else Checkpoint(self.checkpoint)
+        points = None if self.points is None else check_points(self.points, self.domain)
+        return self._replace(points=points, fixed=check_fixed(self.fixed, self.domain, real), checkpoint=files)
+
+
+def check_callback(callback: Callable[[np.void], object] | None) -> None:
+    """Check the function that a run calls with each row of its history.
 
     Raises
     ------
-    InputError, InputTypeError
-        If a value is not as expected.
+    InputTypeError
     """
-    if options is not None and not isinstance(options, MultilevelOptions | PaperOptions):
+    if callback is None:
+        return
+    if not callable(callback):
         raise InputTypeError(
-            f"options is {options!r:.60} of type {type(options).__name__}, expected clvoro.MultilevelOptions (methods "
-            "adaptive, exact, transport) or clvoro.PaperOptions (the other methods)"
+            f"callback is {callback!r} of type {type(callback).__name__}, expected a function of a row of the history"
         )
-    start, own = (points, None) if isinstance(points, str) else ("density", points)
-    special = {} if options is None else vars(options)
-    return Options(start=start, **given, **special), own
+    check_callable("callback", callback, "a row of the history", "write lambda row: callback(...)")
 
 
 def arguments_of_run(settings: Mapping[str, Any]) -> dict[str, Any]:

@@ -11,28 +11,19 @@ import numpy as np
 
 from ..arguments import coincident_named, warn
 from ..errors import CoarseSizeWarning, InputError, SizeFieldError
-from ..geometry.boundary_layers import (
-    apart_from,
-    beyond_layers,
-    check_extruded,
-    check_gaps,
-    count_prisms,
-    count_rows,
-    free_domain,
-    place_layers,
-)
+from ..geometry.boundary_layers import apart_from
 from ..geometry.domain import Domain
 from ..geometry.fixed_generators import FixedGenerators
 from ..geometry.gaps import NARROW
 from ..sizing import Sizing, as_field
-from ..sizing.distance import before_layers, limit_beside_borders, limit_beside_layers
-from ..sizing.field import Field, on_domain
-from .diagnostics import check_precision, warn_of_mismatches, warn_of_narrow_parts
-from .estimates import SAMPLE, Extras, check_memory, check_prisms, expected_images, expected_surplus, holder_of_all
+from ..sizing.field import on_domain
+from .diagnostics import check_precision, warn_of_narrow_parts
+from .estimates import SAMPLE, Extras, check_memory, expected_images, expected_surplus, holder_of_all
 from .fixed_points import check_beside_borders, check_room, place_in_corners
+from .layers import Layout, lay_out
 from .methods import MOVING, Relaxation, make_method
 from .moving.lattice import lattice_points
-from .options import Options
+from .options import Options, RunArguments
 from .plan.actions import Action, Prescribe
 from .plan.efforts import NEAR_COUNT, NEAR_ERROR, choose_error_target, is_near, steep_share
 from .plan.schedule import Begins, adaptive_schedule, auto_levels, repeated_schedule
@@ -46,6 +37,19 @@ _APART = 0.7
 """Least distance of generators around concave creases from those beside surfaces inside, over h."""
 
 
+class CellCount(NamedTuple):
+    """How many cells a run makes."""
+
+    tree: DensityTree | None
+    """Number of cells in each part of the domain; None if the method keeps the number of given points."""
+    required: float
+    """Number of cells that the size field requires, or of given points if the method keeps it."""
+    target: int
+    """Number of cells of the finest level."""
+    factor: float
+    """Factor on the size field with which it requires as many."""
+
+
 @dataclass(frozen=True)
 class Prepared:
     """What a run needs before it begins."""
@@ -56,12 +60,7 @@ class Prepared:
     """(n, d) ndarray or None. Points of the caller, or some of them, then new ones (`without_far`)."""
     rows: np.ndarray
     """(m, d) ndarray. Generators of layers, which do not move."""
-    tree: DensityTree | None
-    """Number of cells in each part of the domain; None if the method keeps the number of given points."""
-    required: float
-    """Number of cells that the size field requires, or of given points if the method keeps it."""
-    target: int
-    """Number of cells of the finest level."""
+    count: CellCount
     lattice: np.ndarray | None
     """(n, d) ndarray or None. Generators at the start of a moving mesh."""
     levels: int
@@ -81,13 +80,10 @@ class Prepared:
         return np.concatenate([np.full(len(self.rows), -1), own]).astype(np.int32)
 
 
-class GivenPoints(NamedTuple):
-    """How a run uses the points of the caller."""
+class Beginning(NamedTuple):
+    """What a run begins with."""
 
-    near: bool = False
-    """Their mesh nearly has the sizes: it is only corrected."""
-    replaced: bool = False
-    """Random points replace those that are far from the sizes."""
+    begins: Begins
     why: str = ""
     """The reason, for the settings of the result; empty if there are no points, or the method keeps their number."""
 
@@ -103,114 +99,87 @@ class Plan:
     """The trade of sizes against shape, in words."""
 
 
-def prepare(
-    stages: Stages,
-    domain: Domain,
-    size: object,
-    points: np.ndarray | None,
-    options: Options,
-    max_levels: int | None = None,
-    fixed: np.ndarray | None = None,
-) -> Prepared:
-    """Check the arguments of a run against each other, and count cells, levels and bytes.
+def prepare(stages: Stages, arguments: RunArguments, max_levels: int | None = None) -> Prepared:
+    """Check the `arguments` of a run, which are checked one by one, against each other; count cells, levels and bytes.
 
     Parameters
     ----------
-    size : number, callable or clvoro.sizing field
-    points : (n, d) array, optional
-        Generators of the caller, checked.
     max_levels : int, optional
         Largest automatic number of coarser levels.
-    fixed : (k, d) array, optional
-        Fixed generators, checked.
 
     Raises
     ------
     InputError, InputTypeError, SizeFieldError, MemoryLimitError
     """
-    fixed = np.empty((0, domain.dim)) if fixed is None else fixed
-    _check_together(domain, points, fixed, options)
-    given_field = on_domain(domain, as_field(size))
-    rows, free, field = _place_layers(stages, domain, given_field, options, len(fixed))
-    if domain.borders is not None:
-        field = limit_beside_borders(field, *domain.borders.narrow_places(free, field))
+    domain, _, options, points, fixed, _ = arguments
+    _check_together(arguments)
+    size = on_domain(domain, as_field(arguments.size))
+    layout = lay_out(stages.engine, domain, size, options.layers, options.n_cells, len(fixed))
     kept_rows = None
     if points is not None and options.layers:
-        beyond = (
-            beyond_layers(domain, options.layers, points) if domain.extrudes_layers else apart_from(points, rows, free)
-        )
-        kept_rows = np.flatnonzero(beyond)
-        if not kept_rows.size:
-            raise InputError(
-                f"points has {len(points)} points in the layers, expected some beyond them; give others, or leave "
-                "points out"
-            )
+        kept_rows = layout.beyond(points)
         points = points[kept_rows]
-    sizing = Sizing(stages.engine, domain, field, gradient_step=GRADIENT_STEP)
-    # The other methods keep the number of given points.
-    kept = points is not None and not options.multilevel
-    tree = None if kept else density_tree(sizing, free)
-    required = float(len(points)) if points is not None and tree is None else tree.integral + len(rows)  # type: ignore[union-attr]
-    warn_of_mismatches(given_field, domain, options.layers)
-    target, factor = _count(domain, sizing, tree, required, options)
-    if tree is not None and required * factor**-domain.cell_dim >= 0.5:
-        warn_of_narrow_parts(domain, lambda x: factor * sizing(x))
-    if len(fixed):
-        check_room(fixed, domain, free, rows, factor * sizing(fixed))
-    own = 1.0
-    if not options.multilevel and (tree is not None or domain.cutting_edges):
-        own = _own_factor(sizing, free, tree, target)
-    scale = factor if domain.borders is not None else factor * own
-    around = _place_around(domain, free, fixed, rows, lambda x: scale * np.asarray(sizing(x)), target, tree is not None)
-    if around is not None:
-        fixed = np.concatenate([fixed, around.points])
-    after = given_field if options.layers and not len(rows) else None
-    setup = Setup(stages, domain, sizing, free, len(fixed) + len(rows), fixed, factor, own, around, after)
-    lattice = lattice_points(domain, target) if options.method in MOVING else None
-    levels = _count_levels(setup, points, target, len(rows), options) if options.multilevel else 0
+    sizing = Sizing(stages.engine, domain, layout.field, gradient_step=GRADIENT_STEP)
+    count = _count(layout, sizing, points, options)
+    setup = _set_up(stages, layout, sizing, count, fixed, options)
+    lattice = lattice_points(domain, count.target) if options.method in MOVING else None
+    levels = _count_levels(setup, points, count.target, len(layout.rows), options) if options.multilevel else 0
     if options.levels == "auto" and max_levels is not None:
         levels = min(levels, max_levels)
-    most = max(target, 0 if points is None else len(points))
-    if domain.extrudes_layers:
-        check_prisms(count_prisms(domain, options.layers, lambda x: factor * sizing(x)))
-    memory = _estimate_memory(setup, options, tree, required, most, levels)
-    return Prepared(options, setup, points, rows, tree, required, target, lattice, levels, kept_rows, memory)
+    most = max(count.target, 0 if points is None else len(points))
+    layout.check_prisms(lambda x: count.factor * sizing(x))
+    memory = _estimate_memory(setup, options, count, most, levels)
+    return Prepared(options, setup, points, layout.rows, count, lattice, levels, kept_rows, memory)
+
+
+def _set_up(
+    stages: Stages, layout: Layout, sizing: Sizing, count: CellCount, fixed: np.ndarray, options: Options
+) -> Setup:
+    """Return what all levels have in common: the generators that do not move, and the factors on the size field."""
+    domain, free, rows = layout.domain, layout.free, layout.rows
+    if len(fixed):
+        check_room(fixed, domain, free, rows, count.factor * sizing(fixed))
+    own = 1.0
+    if not options.multilevel and (count.tree is not None or domain.cutting_edges):
+        own = _own_factor(sizing, free, count)
+    scale = count.factor if domain.borders is not None else count.factor * own
+    around = _place_around(layout, fixed, lambda x: scale * np.asarray(sizing(x)), count)
+    if around is not None:
+        fixed = np.concatenate([fixed, around.points])
+    held = len(fixed) + len(rows)
+    return Setup(stages, domain, sizing, free, held, fixed, count.factor, own, around, layout.after_layers)
 
 
 def _place_around(
-    domain: Domain,
-    free: Domain,
-    fixed: np.ndarray,
-    rows: np.ndarray,
-    size: Callable[[np.ndarray], np.ndarray],
-    target: int,
-    drawn: bool,
+    layout: Layout, fixed: np.ndarray, size: Callable[[np.ndarray], np.ndarray], count: CellCount
 ) -> FixedGenerators | None:
-    """Return generators beside borders, and, where the others are `drawn` at random, in corners and creases, if any."""
+    """Return generators beside borders, and, if the others are random, in corners and creases, if there are any."""
+    domain, free, rows, drawn = layout.domain, layout.free, layout.rows, count.tree is not None
     if domain.borders is None:
-        return place_in_corners(domain, free, fixed, rows, size, target) if drawn else None
+        return place_in_corners(domain, free, fixed, rows, size, count.target) if drawn else None
     around = domain.borders.place(domain, free, size)
     check_beside_borders(around, domain, fixed)
     if drawn and domain.borders.sheets is not None:
-        corners = place_in_corners(domain, free, fixed, rows, size, target)
+        corners = place_in_corners(domain, free, fixed, rows, size, count.target)
         around = around.with_others(corners, lambda x: _APART * np.asarray(size(x)))
-    if (count := len(fixed) + len(around)) > target:
+    if (held := len(fixed) + len(around)) > count.target:
         raise InputError(
-            f"the mesh has {target} cells, but {count} generators are beside the {domain.borders.word} or fixed, "
+            f"the mesh has {count.target} cells, but {held} generators are beside the {domain.borders.word} or fixed, "
             "expected at least as many cells; use smaller sizes, or more cells"
         )
     return around
 
 
-def _own_factor(sizing: Sizing, free: Domain, tree: DensityTree | None, count: int) -> float:
-    """Return the size of `count` cells over the size field; 1 if it is near 1."""
-    tree = density_tree(sizing, free) if tree is None else tree
-    factor = (tree.integral / count) ** (1 / free.cell_dim)
+def _own_factor(sizing: Sizing, free: Domain, count: CellCount) -> float:
+    """Return the size of the cells over that of the size field; 1 if it is near 1."""
+    tree = density_tree(sizing, free) if count.tree is None else count.tree
+    factor = (tree.integral / count.target) ** (1 / free.cell_dim)
     return factor if not 1 / NEAR_SIZE < factor < NEAR_SIZE else 1.0
 
 
-def _check_together(domain: Domain, points: np.ndarray | None, fixed: np.ndarray, options: Options) -> None:
+def _check_together(arguments: RunArguments) -> None:
     """Raise if the arguments of a run do not fit together."""
+    domain, _, options, points, fixed, _ = arguments
     n_cells, method = options.n_cells, options.method
     if n_cells is not None:
         domain.require_no_holes("n_cells is given")
@@ -248,39 +217,23 @@ def _check_together(domain: Domain, points: np.ndarray | None, fixed: np.ndarray
         )
 
 
-def _place_layers(
-    stages: Stages, domain: Domain, field: Field, options: Options, n_fixed: int
-) -> tuple[np.ndarray, Domain, Field]:
-    """Return the generators of the layers, the domain without them, and the size field that fits beside them."""
-    layers, n_cells = options.layers, options.n_cells
-    if not layers:
-        return np.empty((0, domain.dim)), domain, field
-    if domain.extrudes_layers:
-        check_extruded(domain, layers)
-        return np.empty((0, domain.dim)), domain, before_layers(field, domain, layers)
-    check_memory(stages.engine, count_rows(domain, layers), domain)
-    check_gaps(domain, layers)
-    rows, free = place_layers(domain, layers), free_domain(domain, layers)
-    least = len(rows) + max(free.n_pieces, n_fixed)
-    if n_cells is not None and n_cells < least:
-        raise InputError(
-            f"n_cells is {n_cells}, but layers have {len(rows)} cells, expected at least {least}; leave "
-            "n_cells out, or make the cells of the layers wider"
-        )
-    return rows, free, limit_beside_layers(field, domain, layers)
-
-
-def _count(
-    domain: Domain, sizing: Sizing, tree: DensityTree | None, required: float, options: Options
-) -> tuple[int, float]:
-    """Return the number of cells of the finest level, and the factor on the size field that gives it."""
-    n_cells = options.n_cells
+def _count(layout: Layout, sizing: Sizing, points: np.ndarray | None, options: Options) -> CellCount:
+    """Return the number of cells that the size field requires, and that of the finest level."""
+    domain, n_cells = layout.domain, options.n_cells
+    # The other methods keep the number of given points.
+    kept = points is not None and not options.multilevel
+    tree = None if kept else density_tree(sizing, layout.free)
+    required = float(len(points)) if points is not None and tree is None else tree.integral + len(layout.rows)  # type: ignore[union-attr]
+    layout.warn_of_mismatches()
     target = n_cells if n_cells is not None else max(1, round(required))
     _check_sizes(domain, sizing, tree, required, target, options)
     if n_cells is None and required < 0.5:
         _warn_of_coarse_size(domain, required)
     scaled = options.multilevel and n_cells is not None
-    return target, (required / target) ** (1 / domain.cell_dim) if scaled else 1.0
+    factor = (required / target) ** (1 / domain.cell_dim) if scaled else 1.0
+    if tree is not None and required * factor**-domain.cell_dim >= 0.5:
+        warn_of_narrow_parts(domain, lambda x: factor * sizing(x))
+    return CellCount(tree, required, target, factor)
 
 
 def _check_sizes(
@@ -329,10 +282,9 @@ def _warn_of_coarse_size(domain: Domain, required: float) -> None:
     warn(message + domain.unit_hint, CoarseSizeWarning)
 
 
-def _estimate_memory(
-    setup: Setup, options: Options, tree: DensityTree | None, required: float, most: int, levels: int
-) -> float:
+def _estimate_memory(setup: Setup, options: Options, count: CellCount, most: int, levels: int) -> float:
     """Return the bytes that the run of at most `most` cells needs on the device."""
+    tree, required = count.tree, count.required
     domain, sizing, engine, power = setup.domain, setup.sizing, setup.stages.engine, options.method == "transport"
     surplus, images, boundary = 0.0, None, None
     if options.multilevel and tree is not None:
@@ -415,12 +367,12 @@ def _sample(prepared: Prepared) -> np.ndarray:
         return domain.even_points(n)
     if options.start == "uniform":
         return sample_uniform(setup.free, n, options.seed, real)
-    return sample_density(setup.sizing, setup.free, n, options.seed, real, prepared.tree)
+    return sample_density(setup.sizing, setup.free, n, options.seed, real, prepared.count.tree)
 
 
 def _cells_at_start(prepared: Prepared) -> int:
     """Return the number of cells of the coarsest level, without those of layers."""
-    cells = (prepared.target - len(prepared.rows)) / 2 ** (prepared.setup.domain.cell_dim * prepared.levels)
+    cells = (prepared.count.target - len(prepared.rows)) / 2 ** (prepared.setup.domain.cell_dim * prepared.levels)
     return max(prepared.setup.free.least_cells(prepared.levels > 0), round(cells))
 
 
@@ -431,27 +383,27 @@ def without_far(prepared: Prepared, max_levels: int | None = None) -> Prepared:
     """
     given, setup, options = prepared.points, prepared.setup, prepared.options
     assert given is not None
-    assert prepared.tree is not None
+    assert prepared.count.tree is not None
     n, real = _cells_at_start(prepared), setup.stages.engine.real
-    points, rows = replace_far(given, prepared.tree, setup.free, n, options.seed, real)
+    points, rows = replace_far(given, prepared.count.tree, setup.free, n, options.seed, real)
     if len(rows) == len(given):
         return prepared
     before = np.arange(len(given)) if prepared.kept_rows is None else prepared.kept_rows
     if len(rows):
         new = np.full(len(points) - len(rows), -1)
         return replace(prepared, points=points, kept_rows=np.concatenate([before[rows], new]))
-    levels = _count_levels(setup, None, prepared.target, len(prepared.rows), options)
+    levels = _count_levels(setup, None, prepared.count.target, len(prepared.rows), options)
     levels = levels if max_levels is None else min(levels, max_levels)
     # Points are drawn for the coarsest level from the tree as it was.
     tree = density_tree(setup.sizing, setup.free)
-    return replace(prepared, points=None, kept_rows=None, levels=levels, tree=tree)
+    return replace(prepared, points=None, kept_rows=None, levels=levels, count=prepared.count._replace(tree=tree))
 
 
-def judge_points(prepared: Prepared, mesh: MeshState) -> tuple[GivenPoints, Prepared]:
+def judge_points(prepared: Prepared, mesh: MeshState) -> tuple[Beginning, Prepared]:
     """Return how the run uses the points of the caller, whose mesh is `mesh`, and the run without far ones."""
     options, n = prepared.options, mesh.total
     if prepared.points is None or not options.multilevel:
-        return GivenPoints(), prepared
+        return Beginning("random" if prepared.points is None else "mesh"), prepared
     s = mesh.summaries.read()
     mean, quality = s["error"].magnitude / n, s["quality"].sum / n
     missing = mesh.missing_cells() if options.n_cells is None else float(options.n_cells - n)
@@ -459,29 +411,33 @@ def judge_points(prepared: Prepared, mesh: MeshState) -> tuple[GivenPoints, Prep
     off = f"{abs(missing) / n:.1%} of the cells too {'few' if missing > 0 else 'many'}"
     found = f"mean |e| {mean:.2g}, {off}, mean Q {quality:.3f}"
     if near:
-        return GivenPoints(near=True, why=f"the given mesh is near and only corrected ({found})"), prepared
+        return Beginning("near", f"the given mesh is near and only corrected ({found})"), prepared
     if options.levels == "auto" and (after := without_far(prepared)) is not prepared:
-        kept = 0 if after.kept_rows is None else np.count_nonzero(after.kept_rows >= 0)
-        share = f"{1 - kept / len(prepared.points):.0%} of the given points are" if kept else "the given points are all"
-        return GivenPoints(replaced=True, why=f"{share} far from the sizes, and were replaced ({found})"), after
+        if after.points is None:
+            return Beginning(
+                "random", f"the given points are all far from the sizes, and were replaced ({found})"
+            ), after
+        assert after.kept_rows is not None
+        share = f"{1 - np.count_nonzero(after.kept_rows >= 0) / len(prepared.points):.0%} of the given points are"
+        return Beginning("partly random", f"{share} far from the sizes, and were replaced ({found})"), after
     why = (
         f"the given points are too few to be corrected: {prepared.levels} refinements led to the sizes"
         if prepared.levels
         else f"the given mesh is not near, and all steps were taken ({found}; near means at most {NEAR_ERROR:g}, "
         f"{NEAR_COUNT:.0%}, and regular cells)"
     )
-    return GivenPoints(why=why), prepared
+    return Beginning("mesh", why), prepared
 
 
-def plan(prepared: Prepared, given: GivenPoints) -> Plan:
-    """Return the schedule of the run, which uses the points of the caller as `given`."""
+def plan(prepared: Prepared, begins: Begins) -> Plan:
+    """Return the schedule of the run."""
     options, levels, domain = prepared.options, prepared.levels, prepared.setup.domain
     if not options.multilevel:
         relaxation = Relaxation(options.alpha, options.k)
         steps = STEPS if options.max_steps is None else options.max_steps
         method = make_method(options.method, relaxation, prepared.lattice, options.tol)
         return Plan(repeated_schedule(method, steps))
-    near = given.near
+    near = begins == "near"
     dim, effort, steep = domain.cell_dim, options.effort, _steepness(prepared)
     smooth = choose_error_target(dim, effort, levels, near)
     target = options.error_target or choose_error_target(dim, effort, levels, near, steep)
@@ -491,7 +447,7 @@ def plan(prepared: Prepared, given: GivenPoints) -> Plan:
         levels,
         options.method in ("exact", "transport"),
         target,
-        begins=_beginning(prepared, given),
+        begins=begins,
         openings=OPENINGS if domain.for_c_grids else 0,
         narrow_parts=domain.cuts_cells,
         most=options.max_steps,
@@ -508,19 +464,13 @@ def plan(prepared: Prepared, given: GivenPoints) -> Plan:
     return Plan(schedule, target, trade)
 
 
-def _beginning(prepared: Prepared, given: GivenPoints) -> Begins:
-    if prepared.points is None:
-        return "random"
-    return "near" if given.near else "partly random" if given.replaced else "mesh"
-
-
 def _steepness(prepared: Prepared) -> float:
     """Return the share of the cells where sizes are steep; 0 where shape is not preferred to sizes.
 
     That is in 3D, on spheres, with few cells, which only serve a tight target, and with exact sizes.
     """
-    tree, setup = prepared.tree, prepared.setup
-    plane = setup.domain.dim == 2 and auto_levels(prepared.target, 2) > 0
+    tree, setup = prepared.count.tree, prepared.setup
+    plane = setup.domain.dim == 2 and auto_levels(prepared.count.target, 2) > 0
     if tree is None or prepared.options.method != "adaptive" or not plane:
         return 0.0
     share = steep_share(setup.factor * tree.slopes_of_size, tree.cells)

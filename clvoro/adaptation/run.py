@@ -8,12 +8,11 @@ import math
 import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
-from os import PathLike
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import numpy as np
 
-from ..arguments import check_callable, check_points
+from ..arguments import check_points
 from ..errors import InputError, InputTypeError, Interrupted
 from ..geometry.domain import Domain
 from ..mesh.diagram import Diagram
@@ -27,48 +26,25 @@ from ..solvers.linear_system import Solution
 from ..tessellation.periodic.images import FewCellsError
 from ..tessellation.readback.parts import CellRows
 from .checkpoint import Checkpointer, Saved, run_fingerprint
-from .diagnostics import (
-    MISSED,
-    warn_of_errors,
-    warn_of_moved_points,
-    warn_of_obtuse_triangles,
-    warn_of_other_sizes,
-    widths_of_layers,
-)
-from .fixed_points import check_fixed, origins, put_back
+from .diagnostics import MISSED, warn_of_errors, warn_of_moved_points, warn_of_obtuse_triangles, warn_of_other_sizes
+from .fixed_points import origins, put_back
 from .gathering import ResultParts
+from .layers import widths_of_layers
 from .methods import MOVING
 from .motion import Displacement, Method
-from .options import Checkpoint, Options, uses
+from .options import Options, RunArguments, uses
 from .plan.actions import CorrectCount, Refine, Step
 from .plan.efforts import EFFORTS
 from .plan.schedule import work_of
-from .preparation import GivenPoints, Plan, Prepared, judge_points, plan, prepare, start, without_far
+from .preparation import Beginning, Plan, Prepared, judge_points, plan, prepare, start, without_far
 from .stages import Stages
 from .tuning import REACHED, RENEWAL, WINDOW
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
 
 INTERRUPTED, STOPPED, UNDER_WAY = "interrupted", "stopped by the callback", "under way"
 MISSES = "plan ended, but the sizes are missed"
 COMPLETED, STALLED = "plan completed", "error and quality no longer improve"
 SETTLED = "tolerance of the moving mesh met"
 """Reasons of converged runs."""
-
-
-def check_run(domain: object, size: object, callback: Callable[[np.void], object] | None) -> None:
-    """Check the kinds of arguments of `Adapter.run` before a run begins."""
-    if callback is not None and not callable(callback):
-        raise InputTypeError(
-            f"callback is {callback!r} of type {type(callback).__name__}, expected a function of a row of the history"
-        )
-    if callback is not None:
-        check_callable("callback", callback, "a row of the history", "write lambda row: callback(...)")
-    if isinstance(size, Domain) and not isinstance(domain, Domain):
-        raise InputTypeError(
-            f"size is the domain {size!r}, and domain is a {type(domain).__name__}; exchange them: run(domain, size)"
-        )
 
 
 def check_shared(domain: Domain, options: Options, fixed: object) -> None:
@@ -82,17 +58,6 @@ def check_shared(domain: Domain, options: Options, fixed: object) -> None:
         what = "layers or fixed generators are given, expected none of them"
     if what:
         raise InputError(f"{what}, since ranks or devices share the run; use an Adapter without comm and devices")
-
-
-class RunArguments(NamedTuple):
-    """Arguments of `Adapter.run`; those of options are merged and checked, the others as the caller gives them."""
-
-    domain: Domain
-    size: object
-    points: ArrayLike | None
-    fixed: ArrayLike | None
-    options: Options
-    checkpoint: str | PathLike[str] | Checkpoint | None
 
 
 class Run:
@@ -130,15 +95,12 @@ class Run:
         on_memory: Callable[[float], object] | None = None,
         alone: Callable[[Stages], AbstractContextManager[object]] = nullcontext,
     ) -> None:
-        domain, size, points, fixed, options, checkpoint = arguments
-        files = checkpoint if isinstance(checkpoint, Checkpoint) else Checkpoint(checkpoint)
-        given = None if points is None else check_points(points, domain)
-        self._stages, self._domain, self._options = stages, domain, options
-        self._fixed = check_fixed(fixed, domain, stages.engine.real)
-        self._files, self._callback, self._on_memory, self._alone = files, callback, on_memory, alone
+        arguments = arguments.checked(stages.engine.real)
+        self._stages, self._domain, self._options = stages, arguments.domain, arguments.options
+        self._callback, self._on_memory, self._alone = callback, on_memory, alone
         self._is_part = stages.engine.peers.count > 1
-        peers, source = stages.engine.peers, files.source
-        self._begin(size, given, saved=None if source is None else peers.agree(lambda: Saved(source, peers)))
+        peers, source = stages.engine.peers, arguments.checkpoint.source
+        self._begin(arguments, saved=None if source is None else peers.agree(lambda: Saved(source, peers)))
 
     def __repr__(self) -> str:
         return (
@@ -147,35 +109,29 @@ class Run:
 
     def _begin(
         self,
-        size: object,
-        points: np.ndarray | None,
+        arguments: RunArguments,
         max_levels: int | None = None,
         saved: Saved | None = None,
-        given: GivenPoints | None = None,
+        beginning: Beginning | None = None,
     ) -> None:
         """Prepare a run, and make its first mesh or read it from a checkpoint.
 
-        `given` is what is known of `points`, from a first try or the checkpoint.
+        `beginning` is what a first try has found, or the checkpoint has.
         """
-        stages, options, files = self._stages, self._options, self._files
-        fingerprint: dict[str, Any] = {}
-        if saved is not None or files.path is not None:
-            fingerprint = run_fingerprint(self._domain, vars(options), stages.engine.real, points, self._fixed)
+        stages, files, peers = self._stages, arguments.checkpoint, self._stages.engine.peers
+        identity: dict[str, Any] = {}
+        if saved is not None or files.path is not None or peers.count > 1:
+            identity = run_fingerprint(arguments, stages.engine.real)
         if saved is not None:
-            stages.engine.peers.agree(lambda: saved.check_fingerprint(fingerprint))
-            max_levels, given = saved.levels, saved.given
-
-        def prepared_run() -> Prepared:
-            made = prepare(stages, self._domain, size, points, options, max_levels, self._fixed)
-            return without_far(made, max_levels) if given is not None and given.replaced else made
-
-        prepared = stages.engine.peers.agree(
-            prepared_run,
+            peers.agree(lambda: saved.check_fingerprint(identity))
+            max_levels, beginning = saved.levels, saved.beginning
+        prepared = peers.agree(
+            lambda: _prepared(stages, arguments, max_levels, beginning),
             lambda made: {
-                **run_fingerprint(self._domain, vars(options), stages.engine.real, points, self._fixed),
-                "cells": made.target,
+                **identity,
+                "cells": made.count.target,
                 "levels": made.levels,
-                "cells for the size field": made.required,
+                "cells for the size field": made.count.required,
             },
         )
         if hasattr(self, "state"):
@@ -186,23 +142,22 @@ class Run:
         if saved is None:
             try:
                 self.state = start(prepared)
-                if given is None:
-                    given, after = judge_points(prepared, self.state)
+                if beginning is None:
+                    beginning, after = judge_points(prepared, self.state)
                     if after is not prepared:
                         stages.release()
                         prepared = after
                         self.state = start(prepared)
             except FewCellsError as error:
-                self._begin(size, points, self._fewer_levels(prepared.levels, error), given=given)
+                self._begin(arguments, self._fewer_levels(prepared.levels, error), beginning=beginning)
                 return
-        assert given is not None
-        self.given = given
-        self._size, self._points = size, points
-        planned = plan(prepared, given)
+        assert beginning is not None
+        self.arguments, self.beginning = arguments, beginning
+        planned = plan(prepared, beginning.begins)
         self._writer = None
         if files.path is not None:
-            path, peers = files.path, stages.engine.peers
-            self._writer = peers.agree(lambda: Checkpointer(path, files.every, fingerprint, planned.schedule, peers))
+            path = files.path
+            self._writer = peers.agree(lambda: Checkpointer(path, files.every, identity, planned.schedule, peers))
         self._renews = saved is not None or (self._writer is not None and files.every < math.inf)
         self.pace = RENEWAL if files.every else 0
         if saved is not None:
@@ -213,7 +168,7 @@ class Run:
     def _set_out(self, prepared: Prepared, planned: Plan, saved: Saved | None) -> None:
         """Set how far the run has come: it begins, or it goes on where it was saved."""
         multilevel = self._options.multilevel
-        self.schedule, self.target = planned.schedule, float(prepared.target)
+        self.schedule, self.target = planned.schedule, float(prepared.count.target)
         self.levels = self.level = prepared.levels
         self._origins = prepared.origins
         self.n_cells = self._options.n_cells if multilevel else None
@@ -245,12 +200,13 @@ class Run:
             "error_target": planned.error_target,
             "dtype": self._stages.engine.real.name,
             "layers": [repr(layer) for layer in options.layers],
-            "fixed": len(self._fixed),
+            "fixed": len(self.arguments.fixed),
         }
         used = {name: value for name, value in settings.items() if uses(options.method, name)}
-        widths = widths_of_layers(as_field(self._size), self._domain, options.layers) if options.layers else ""
+        size = as_field(self.arguments.size)
+        widths = widths_of_layers(size, self._domain, options.layers) if options.layers else ""
         used |= {"widths": widths} if widths else {}
-        used |= {"path": self.given.why} if self.given.why else {}
+        used |= {"path": self.beginning.why} if self.beginning.why else {}
         return {**used, "trade": planned.trade} if options.multilevel else used
 
     def _fewer_levels(self, levels: int, error: FewCellsError) -> int:
@@ -321,13 +277,12 @@ class Run:
             As `Adapter.run`.
         """
         with self._alone(self._stages):
-            check_run(self._domain, size, None)
             if self._result is None:
                 origin, scale = self._domain.frame
                 points = self.state.to_host(self.state.points, scale) + origin
             else:
                 points = self._result.points
-            self._begin(size, check_points(points, self._domain))
+            self._begin(self.arguments._replace(size=size, points=check_points(points, self._domain)))
 
     def _advance(self) -> bool:
         """Do actions up to the next row of the history; return whether there is one."""
@@ -348,12 +303,8 @@ class Run:
                     self.position += 1
                     self._keep()
         except FewCellsError as error:
-            self._begin(
-                self._size,
-                self._points,
-                self._fewer_levels(self.levels, error),
-                given=self.given if self.given.replaced else None,
-            )
+            known = self.beginning if _replaces(self.arguments, self.beginning) else None
+            self._begin(self.arguments, self._fewer_levels(self.levels, error), beginning=known)
             return self._advance()
         return len(self.rows) > known
 
@@ -528,18 +479,19 @@ class Run:
         origin, fixed = origins(labels, self.started, mesh.taken), mesh.setup.points
         if self._origins is not None:
             origin = np.where(origin < 0, -1, self._origins[origin])
-        elif self._points is not None:
+        elif self.arguments.points is not None:
             origin = np.full_like(origin, -1)
         parts = None
         if self._is_part:
             parts = ResultParts(mesh.engine, self._domain, CellRows.of(mesh.t, mesh.labels))
-        diagram, settings = mesh.fetch_diagram(len(self._fixed)), dict(self._settings)
+        held = self.arguments.fixed
+        diagram, settings = mesh.fetch_diagram(len(held)), dict(self._settings)
         if self._options.layers and self._domain.extrudes_layers:
             from ..finite_volumes.solid_walls.layers import add_layers
 
             diagram, settings["thickness"] = add_layers(diagram, self._options.layers)
             # Vertices have moved, and generators with them.
-            warn_of_moved_points(self._fixed, diagram, size)
+            warn_of_moved_points(held, diagram, size)
             fixed = fixed[:0]
         if (home := diagram.home) is not None:
             # Cells may have been cut along creases: further parts come last. Generators in thin places may have none.
@@ -593,3 +545,14 @@ class Run:
             # Effort "fast" ends there because its steps end, not because the shape is as good as it gets.
             why = "" if options.effort == "fast" else ", as larger errors hardly give a better shape"
             result.settings["trade"] += f"; it ends at {error:.2g}{why}"
+
+
+def _prepared(stages: Stages, arguments: RunArguments, max_levels: int | None, beginning: Beginning | None) -> Prepared:
+    """Prepare a run, with random points in place of those that are known to be far from the sizes."""
+    made = prepare(stages, arguments, max_levels)
+    return without_far(made, max_levels) if beginning is not None and _replaces(arguments, beginning) else made
+
+
+def _replaces(arguments: RunArguments, beginning: Beginning) -> bool:
+    """Return whether random points replace some of those of the caller, or all."""
+    return arguments.points is not None and beginning.begins in ("random", "partly random")

@@ -11,7 +11,8 @@ import shapely
 
 import clvoro
 from clvoro import sizing
-from clvoro.adaptation.diagnostics import layer_mismatches, warn_of_narrow_parts
+from clvoro.adaptation.diagnostics import warn_of_narrow_parts
+from clvoro.adaptation.layers import layer_mismatches
 from clvoro.cli import command as cli
 from clvoro.errors import CoarseSizeWarning, MismatchWarning, SizeErrorWarning
 

@@ -49,7 +49,7 @@ def test_levels_counts_and_wells_go_with_lines(ctx):
 def test_generators_leave_the_balls(ctx, mesh):
     """One launch against NumPy: out of each ball in turn."""
     from clvoro.adaptation.motion import Moving
-    from clvoro.adaptation.options import merged_options
+    from clvoro.adaptation.options import RunArguments
     from clvoro.adaptation.preparation import prepare, start
     from clvoro.adaptation.stages import Stages
     from clvoro.opencl.engine import Engine
@@ -57,10 +57,8 @@ def test_generators_leave_the_balls(ctx, mesh):
     domain = mesh.diagram.domain
     adapter = clvoro.Adapter(ctx)
     engine = Engine(ctx, adapter.queue, 2, np.dtype(float), domain.traits(np.dtype(float)))
-    options, _ = merged_options(
-        "density", clvoro.MultilevelOptions(levels=0), method="adaptive", n_cells=None, layers=()
-    )
-    state = start(prepare(Stages(engine), domain, 0.08, None, options))
+    arguments = RunArguments.of(domain, 0.08, "density", clvoro.MultilevelOptions(levels=0))
+    state = start(prepare(Stages(engine), arguments.checked(engine.real)))
     pairs, balls = state.setup.around, state.balls
     points, labels = state.points.get(), state.labels.get()
     scale = domain.frame[1]

@@ -276,13 +276,12 @@ def test_files_hold_the_domain(tmp_path) -> None:
 
 
 def test_checkpoints_tell_domains_apart() -> None:
-    from clvoro.adaptation.checkpoint import run_fingerprint
+    from clvoro.adaptation.checkpoint import domain_fingerprint
 
     domains = [clvoro.Polygon(SQUARE), clvoro.Polygon(SQUARE, [HOLE]), clvoro.Box((0, 0), (4, 3))]
-    options: dict = {"layers": []}
-    described = [json.dumps(run_fingerprint(d, options, np.dtype(float), None)) for d in domains]
+    described = [json.dumps(domain_fingerprint(d)) for d in domains]
     assert len(set(described)) == 3
-    again = run_fingerprint(clvoro.Polygon(SQUARE.copy()), options, np.dtype(float), None)
+    again = domain_fingerprint(clvoro.Polygon(SQUARE.copy()))
     assert json.dumps(again) == described[0]
 
 
