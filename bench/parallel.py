@@ -1,17 +1,17 @@
 """Runs over the ranks of MPI: bits, sizes and shapes, processor time, and what ranks exchange.
 
     python bench/parallel.py [--ranks 1,2,4,8] [--cells 10000] [--dims 2,3] [--effort fast] [--periodic]
-                             [--device NAME] [--dtype float32] [--json]
+                             [--sphere] [--device NAME] [--dtype float32] [--json]
 
 For each number of ranks the script starts itself under `mpiexec`; with PoCL each rank has one core. `bits` says whether
 the diagram of random points has the same bits as with the first number of ranks. The other columns are of a run in a
-box with sizes from h to 3 h, after a run of fewer cells, which builds kernels. `CPU s` is its processor time, summed
-over ranks, and `over one` the ratio to that of the first number of ranks. `floor` is the same ratio for as many
-processes at the same time that each make a mesh of n / p cells without messages: it has the cost of the fixed work of a
-step, and of shared cores and caches. `exchanges` and `reductions` are the rounds of messages
+box, or on a sphere, with sizes from h to 3 h, after a run of fewer cells, which builds kernels. `CPU s` is its
+processor time, summed over ranks, and `over one` the ratio to that of the first number of ranks. `floor` is the same
+ratio for as many processes at the same time that each make a mesh of n / p cells without messages: it has the cost of
+the fixed work of a step, and of shared cores and caches. `exchanges` and `reductions` are the rounds of messages
 between pairs of ranks, and of sums over all ranks, per step. Some of both take place at the same time; `waits` counts
-how often a rank waits for others. `ghosts` is the number of ghosts of rank 0 in
-the last diagram over 2 d (n / p)^((d - 1) / d), an estimate of one layer of cells around a part. `one round` is the
+how often a rank waits for others. `ghosts` is the number of ghosts of rank 0 in the last diagram over
+2 d (n / p)^((d - 1) / d), an estimate of one layer of cells around a part. `one round` is the
 share of diagrams whose cells were made once, since no ghosts were missing, and `asked` how often ranks asked each other
 for ghosts, over the number of diagrams. Needs `pip install -e '.[mpi]'`.
 """
@@ -54,7 +54,9 @@ def measure_rank(options: argparse.Namespace) -> None:
     from mpi4py import MPI
 
     dim, cells, effort, comm = options.rank, options.cells, options.effort, MPI.COMM_WORLD
-    box, rounds, ghosts, asked = clvoro.Box((0,) * dim, (1,) * dim, periodic=options.periodic), [], [0], [0]
+    rounds, ghosts, asked, box = [], [0], [0], clvoro.Box((0,) * dim, (1,) * dim, periodic=options.periodic)
+    x, domain = np.random.default_rng(1).random((cells, dim)), clvoro.Sphere(0.5) if options.sphere else box
+    x, dim = x - 0.5 * options.sphere, domain.cell_dim
     adapter = clvoro.Adapter(clvoro.create_context(options.device), options.dtype, comm=comm)
     finish = PartSteps._finished
 
@@ -68,18 +70,17 @@ def measure_rank(options: argparse.Namespace) -> None:
         return found
 
     PartSteps._finished = noted
-    x = np.random.default_rng(1).random((cells, dim))
-    whole = adapter.run(box, cells ** (-1 / dim), points=x, method="lloyd", max_steps=0).gather()
+    whole = adapter.run(domain, cells ** (-1 / dim), points=x, method="lloyd", max_steps=0).gather()
     digest = hashlib.sha256()
     for name in ("neighbors", "volumes", "centroids", "face_measures") if whole is not None else ():
         digest.update(np.ascontiguousarray(getattr(whole, name)))
     factor = {2: 2 / 3, 3: (13 / 27) ** 0.5}[dim]
-    h = factor * cells ** (-1 / dim)
+    h = factor * (domain.measure / cells) ** (1 / dim)
 
     def run(by: clvoro.Adapter, h: float) -> tuple[clvoro.Result, float]:
         comm.Barrier()
         began = time.process_time()
-        mesh = by.run(box, lambda p: h * (1 + 2 * p[:, 0]), effort)
+        mesh = by.run(domain, lambda p: h * (1 + 2 * (p[:, 0] - domain.lower[0])), effort)
         return mesh, comm.allreduce(time.process_time() - began)
 
     run(adapter, 4 * h)  # builds kernels
@@ -122,12 +123,13 @@ def main() -> None:
     p.add_argument("--dims", type=counts, default=[2, 3], help="dimensions")
     p.add_argument("--effort", default="fast", help="effort of the run")
     p.add_argument("--periodic", action="store_true", help="a box without walls")
+    p.add_argument("--sphere", action="store_true", help="a sphere in place of boxes")
     p.add_argument("--rank", type=int, help="dimension for which each rank measures; used by the script itself")
     options = p.parse_args()
     if options.rank:
         measure_rank(options)
         return
-    for dim in options.dims:
+    for dim in [3] if options.sphere else options.dims:
         table, first = Report(options.json, COLUMNS), {}
         for ranks in options.ranks:
             found = run_ranks(ranks, [__file__, *sys.argv[1:], "--rank", str(dim)], check=True)
@@ -136,7 +138,7 @@ def main() -> None:
             bits = "same" if record["digest"] == first["digest"] else "differ"
             ratios = {"over_one": record["cpu"] / first["cpu"], "floor": record["least"] / first["least"]}
             table.add(record | {"bits": bits, **ratios})
-        table.finish(f"Ranks in {dim}D, effort {options.effort}")
+        table.finish(f"Ranks {'on a sphere' if options.sphere else f'in {dim}D'}, effort {options.effort}")
 
 
 if __name__ == "__main__":

@@ -153,7 +153,7 @@ def check_memory(
     """
     device = engine.queue.device
     name, available = device.name.strip(), available_memory(device)
-    own = n if engine.peers.count == 1 else cells_of_part(n, engine.dim, engine.peers.count)
+    own = n if engine.peers.count == 1 else cells_of_part(n, engine.cell_dim, engine.peers.count)
     needed = estimate_memory(engine, own, domain, extras, run=run, power=power, exact=exact)
     if own > MAX_CELLS or n > MAX_LABELS:
         raise MemoryLimitError(

@@ -35,9 +35,10 @@ from .polyhedra import Polyhedra
 from .stages import TessellationStages
 from .steps import DomainSteps, Sort
 
-FIRST_REACH = 1.9, 3.3
-"""Radius of the first balls over the spacing of the generators around: where only own cells must be final (3D), and
-where the cells of neighboring ghosts must be final, too (2D)."""
+FIRST_REACH = {(3, 3): 1.9, (2, 2): 3.3, (3, 2): 2.4}
+"""Radius of the first balls over the spacing of the generators around, by the dimensions of space and cells. Where
+cells have two, those of neighboring ghosts must be final, too. On a sphere the spacing is overestimated: bins are cubes
+in space."""
 RUN = 32
 """Number of successive generators from which their spacing is estimated."""
 JUMP = 8
@@ -319,7 +320,7 @@ class PartSteps(DomainSteps):
         self._sent = [np.empty(0, np.int32) for _ in range(self.peers.count * len(self._shifts))]
         self._sides, self._rows = np.empty(0, int), np.empty(0, np.int32)
         self._share_landmarks(x)
-        self._caps = FIRST_REACH[self._reads_rows] * self._chunks.spacings
+        self._caps = FIRST_REACH[self.domain.dim, self.domain.cell_dim] * self._chunks.spacings
         answers = self._ask(x, self._caps, self._caps)
         self._take(answers)
         self._limit(answers)
