@@ -204,6 +204,13 @@ class Diagram(MeshOutput):
         """Whether it is a power diagram. Its cells need not contain their generators, and may be empty."""
         return "weights" in self._arrays
 
+    @cached_property
+    def has_moved_vertices(self) -> bool:
+        """Whether vertices are off the planes between generators: in solids, and beside curved surfaces inside."""
+        borders = self.domain.borders
+        inside = borders is not None and borders.sheets is not None
+        return self.domain.curved_walls or (inside and bool(self.half_faces.bent_cells.any()))
+
     def __reduce__(self) -> tuple[Any, ...]:
         # Arrays that may still be on a device are read.
         return _rebuilt, (self.domain, {n: getattr(self, n) for n in self._arrays}), {"home": self.home}

@@ -394,7 +394,7 @@ def make_faces(diagram: Diagram) -> Faces:
         twin=np.full(len(rows), -1),
         shift=np.where(flipped[:, None], -shift, shift) if flipped.any() else shift,
         half_face=rows,
-        diagram=None if diagram.domain.curved_walls else diagram,
+        diagram=None if diagram.has_moved_vertices else diagram,
         layer=diagram.layer if diagram.layer.any() else None,
     )
 

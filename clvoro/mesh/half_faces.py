@@ -16,6 +16,10 @@ if TYPE_CHECKING:
     from .diagram import Diagram
 
 
+FLAT = 1e-6
+"""A face counts as plane if no corner is farther from its plane than this share of the cell's width."""
+
+
 class HalfFaceArrays:
     """The half-faces of a diagram, in the order of its rows; arrays are made when they are first used."""
 
@@ -121,6 +125,29 @@ class HalfFaceArrays:
         i, j = self.owner[faces], d.neighbors[faces]
         between = self.behind(faces) - d.points[i]
         return d.domain.plane_shares((between**2).sum(axis=1), d.weights[j] - d.weights[i])
+
+    def planes(self, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return unit normals (k, d) of half-faces (k,), and the distances (k,) of their planes from the generators."""
+        d = self.diagram
+        behind, walls = d.neighbors[faces] < 0, -1 - d.neighbors[faces]
+        own = d.points[self.owner[faces]]
+        between = self.behind(faces[~behind]) - own[~behind]
+        lengths = np.linalg.norm(between, axis=1)
+        normals, gaps = np.empty_like(own), np.empty(len(own))
+        normals[~behind] = between / lengths[:, None]
+        gaps[~behind] = self.plane_shares(faces[~behind]) * lengths
+        normals[behind], gaps[behind] = d.domain.toward_walls(walls[behind], own[behind])
+        return normals, gaps
+
+    @cached_property
+    def bent_cells(self) -> np.ndarray:
+        """Whether each cell in 3D has a face with corners off its bisector or wall, (n,) bool."""
+        d = self.diagram
+        face = np.repeat(np.arange(len(d.neighbors)), np.diff(d.face_vertex_starts))
+        owner, (normals, gaps) = self.owner[face], self.planes(np.arange(len(d.neighbors)))
+        heights = ((d.vertices[d.face_vertices] - d.points[owner]) * normals[face]).sum(axis=1)
+        off = np.abs(heights - gaps[face]) > FLAT * np.cbrt(d.volumes[owner])
+        return read_only(np.bincount(owner[off], minlength=len(d)) > 0)
 
     def keys(self, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return keys of the half-faces `faces` (k,) between two cells, and keys of their opposite half-faces.

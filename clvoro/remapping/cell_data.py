@@ -69,7 +69,7 @@ def transfer_values(
         means, low, high, covered = _intersected(ctx, source, target, filled / scale, order, bool(limited))
     bare = np.flatnonzero(covered == 0)
     if same:
-        if not source.domain.curved_walls:
+        if not (source.has_moved_vertices or target.has_moved_vertices):
             _require_cover(np.where(target.volumes > 0, covered, 1))
             covered = np.where(covered > 0, 1.0, 0.0)
         if bare.size:  # empty cells, and thin ones between a curved wall and the planes that bound old cells there
@@ -142,7 +142,7 @@ def _intersected(
     means = space.place(source.centroids)
     if domain.curved:
         means[parts[0].cells] = measures.centroids
-    elif domain.curved_walls:  # as the pieces have them, so that slopes add no mass
+    elif source.has_moved_vertices:  # as the pieces have them, so that slopes add no mass
         moments = parts[0].summed(measures.volumes[:, None] * measures.centroids, len(source))
         volumes = parts[0].summed(measures.volumes, len(source))
         means = np.where(volumes[:, None] > 0, moments / np.maximum(volumes, 1e-300)[:, None], means)
@@ -191,7 +191,7 @@ def _space(source: Diagram, target: Diagram) -> Space:
 
 def _require_volumes(name: str, diagram: Diagram, found: np.ndarray, space: Space) -> None:
     """Raise InputError unless cells have the volumes `found`, in the coordinates of the space."""
-    if diagram.domain.curved_walls:
+    if diagram.has_moved_vertices:
         return
     dim = diagram.domain.cell_dim
     volumes = diagram.volumes / space.scale**dim

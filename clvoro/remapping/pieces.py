@@ -9,14 +9,13 @@ import shapely
 
 from ..mesh.connectivity import following, take_rows
 from ..mesh.diagram import Diagram
+from ..mesh.half_faces import FLAT
 from ..mesh.lookup import cell_shapes
 
 _STRAIGHT = 1e-9
 """A corner that points inwards counts as straight if its edges span no more than this share of the cell's area."""
 _THIN = 1e-12
 """A triangle with less than this share of the cell's area is left out."""
-_FLAT = 1e-6
-"""A face counts as plane if no corner is farther from its plane than this share of the cell's width."""
 _ON_WALL = 1e-3
 """A generator counts as on a wall if its distance from it is less than this share of the cell's width."""
 
@@ -107,12 +106,12 @@ def _between_bisectors(diagram: Diagram) -> Pieces:
     filled = np.diff(diagram.neighbor_starts) > 0
     alone = (neighbors < 0) | diagram.shifts.any(axis=1)
     normals, gaps = np.zeros((len(owner), 3)), np.ones(len(owner))
-    normals[alone], gaps[alone] = _planes(diagram, np.flatnonzero(alone))
+    normals[alone], gaps[alone] = diagram.half_faces.planes(np.flatnonzero(alone))
     # A generator on a wall has no mirror image, and one outside of its cell is in no piece.
     moved = np.zeros(n, bool) | diagram.is_power | (not filled.all())
     moved[owner[gaps < _ON_WALL * np.cbrt(diagram.volumes[owner])]] = True
     others = np.flatnonzero(moved[owner] & ~alone)
-    normals[others], gaps[others] = _planes(diagram, others)
+    normals[others], gaps[others] = diagram.half_faces.planes(others)
     alone[others] = True
     origins = np.where(moved[:, None], diagram.centroids, diagram.points)
     alone = np.flatnonzero(alone)
@@ -120,11 +119,11 @@ def _between_bisectors(diagram: Diagram) -> Pieces:
     gap = gaps[alone] + ((diagram.points[own] - origins[own]) * normal).sum(axis=1)
     neighbors[alone] = n + np.arange(len(alone))
     points = np.concatenate([diagram.points, origins[own] + 2 * gap[:, None] * normal])
-    if not diagram.domain.curved_walls:
+    if not diagram.has_moved_vertices:
         cells = np.flatnonzero(filled)
         starts = np.append(diagram.neighbor_starts[:-1][filled], len(neighbors))
         return Pieces(cells, origins[cells], points, starts, neighbors)
-    bent = _bent_cells(diagram)
+    bent = diagram.half_faces.bent_cells
     cells = np.flatnonzero(filled & ~bent)
     starts, items = take_rows(diagram.neighbor_starts, neighbors, cells)
     parts = _pyramids(diagram, np.flatnonzero(bent[owner]))
@@ -134,18 +133,6 @@ def _between_bisectors(diagram: Diagram) -> Pieces:
     origins = np.concatenate([origins[cells[: len(cells) - len(parts)]], parts.origins])
     points = np.concatenate([points, parts.points])
     return Pieces(cells[order], origins[order], points, *take_rows(starts, items, order))
-
-
-def _bent_cells(diagram: Diagram) -> np.ndarray:
-    """Return which cells of a solid have a face with corners off its bisector or wall: (n,) bool."""
-    face, owner = (
-        np.repeat(np.arange(len(diagram.neighbors)), np.diff(diagram.face_vertex_starts)),
-        diagram.half_faces.owner,
-    )
-    normals, gaps = _planes(diagram, np.arange(len(diagram.neighbors)))
-    corners = diagram.vertices[diagram.face_vertices] - diagram.points[owner[face]]
-    off = np.abs((corners * normals[face]).sum(axis=1) - gaps[face]) > _FLAT * np.cbrt(diagram.volumes[owner[face]])
-    return np.bincount(owner[face], off, len(diagram)) > 0
 
 
 def _pyramids(diagram: Diagram, faces: np.ndarray) -> Pieces:
@@ -161,15 +148,15 @@ def _pyramids(diagram: Diagram, faces: np.ndarray) -> Pieces:
     area = np.add.reduceat(np.cross(corners - middle[face], corners[after] - middle[face]), starts[:-1])
     normal = area / np.maximum(np.linalg.norm(area, axis=1), 1e-300)[:, None]
     edges = corners[after] - corners
-    off = np.abs(((corners - middle[face]) * normal[face]).sum(axis=1)) > _FLAT * width[face]
-    off |= (np.cross(edges, edges[after]) * normal[face]).sum(axis=1) < -((_FLAT * width[face]) ** 2)
+    off = np.abs(((corners - middle[face]) * normal[face]).sum(axis=1)) > FLAT * width[face]
+    off |= (np.cross(edges, edges[after]) * normal[face]).sum(axis=1) < -((FLAT * width[face]) ** 2)
     flat = np.bincount(face, off, len(faces)) == 0
     heights = np.cross(corners - middle[face], corners[after] - middle[face])
     volumes = ((middle - apex)[face] * heights).sum(axis=1) / 6
     # Each edge has a piece of its own, or that of its flat face; pieces without a volume are left out.
     piece = np.where(flat[face], starts[face], np.arange(len(face)))
-    kept = np.bincount(piece, volumes, len(face))[piece] > _FLAT**2 * diagram.volumes[owner][face]
-    kept &= np.linalg.norm(edges, axis=1) > _FLAT * width[face]
+    kept = np.bincount(piece, volumes, len(face))[piece] > FLAT**2 * diagram.volumes[owner][face]
+    kept &= np.linalg.norm(edges, axis=1) > FLAT * width[face]
     rows, own = np.unique(piece[kept], return_inverse=True)
     of, single = face[rows], ~flat[face[rows]]
     origins = 0.75 * middle[of] + 0.25 * apex[of]
@@ -194,16 +181,3 @@ def _pyramids(diagram: Diagram, faces: np.ndarray) -> Pieces:
         np.append(0, np.cumsum(counts)),
         np.argsort(behind, kind="stable"),
     )
-
-
-def _planes(diagram: Diagram, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return unit normals (k, 3) of half-faces (k,), and their distances (k,) from the generators."""
-    behind, walls = diagram.neighbors[faces] < 0, -1 - diagram.neighbors[faces]
-    own = diagram.points[diagram.half_faces.owner[faces]]
-    between = diagram.half_faces.behind(faces[~behind]) - own[~behind]
-    lengths = np.linalg.norm(between, axis=1)
-    normals, gaps = np.empty_like(own), np.empty(len(own))
-    normals[~behind] = between / lengths[:, None]
-    gaps[~behind] = diagram.half_faces.plane_shares(faces[~behind]) * lengths
-    normals[behind], gaps[behind] = diagram.domain.toward_walls(walls[behind], own[behind])
-    return normals, gaps

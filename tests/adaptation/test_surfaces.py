@@ -70,6 +70,16 @@ def test_faces_lie_on_surfaces_between_regions_with_the_volumes_of_the_solids(ct
     # One face for each pair, about as large as a cell.
     assert np.median(f.area[rows]) == pytest.approx(0.01, rel=0.2)
     assert d.check(solver="openfoam")
+    report = d.check()
+    assert report, str(report)
+    # Beside curved surfaces vertices are not on bisectors, and volumes are those of the corners.
+    assert d.has_moved_vertices == ("surfaces inside" in report.checked) == (case in {"ball", "solid"})
+    x = d.vertices.copy()
+    x[corners[np.abs(x[corners] - 0.5).sum(axis=1).argmin()]] += 5e-3
+    found = {finding.name for finding in d.with_arrays(vertices=x).check().findings}
+    assert found >= {"face measures", "surfaces inside"}
+    if case == "ball":
+        assert d.transfer(d.centroids, d) == pytest.approx(d.centroids, abs=1e-12)
 
 
 def test_open_surfaces_end_in_faces(ctx):

@@ -185,7 +185,7 @@ def _finish(check: Check, dtype: object = None, more: Callable[[Rebuilt], None] 
         with np.errstate(all="ignore"):
             _check_structure(check)
             geometry = rebuild_cells(diagram, dtype)
-            if diagram.domain.curved_walls:
+            if diagram.has_moved_vertices:
                 check_solid(check, geometry)
             else:
                 _check_geometry(check, geometry)
@@ -375,7 +375,7 @@ def _check_geometry(check: Check, g: Rebuilt) -> None:
 
 
 def check_solid(check: Check, g: Rebuilt) -> None:
-    """Check the mesh of a solid: measures are those of its corners, and corners of faces on walls lie on the surface.
+    """Check a mesh with moved vertices: measures are those of its corners, and corners of faces on surfaces lie there.
 
     Wall polygons are chords of a curved surface: what the cells lack of the solid, or have beyond it, lies between the
     polygons and the surface. Inside, vertices are equidistant from the generators around them up to what merging and
@@ -412,10 +412,20 @@ def check_solid(check: Check, g: Rebuilt) -> None:
         np.array([abs(total - domain.measure) > most]),
         lambda _: f"the volumes' sum is {total:.17g}, expected {domain.measure:.17g} up to {most:.3g}",
     )
-    if d.layer.any():  # inner vertices have made room for layers
-        return
     inner = np.ones(len(d.vertices), bool)
     inner[corners] = False
+    if domain.borders is not None and domain.borders.sheets is not None:
+        placed = np.unique(take_rows(faces.starts, faces.corners, d.border_faces)[1])
+        placed = placed[inner[placed]]
+        off = domain.borders.sheets.distance(d.vertices[placed])
+        check.note(
+            "surfaces inside",
+            np.maximum(off - 10 * slack, 0),
+            lambda k: f"vertex {placed[k]} of a face on a surface inside is off it by {off[k]:.3g}",
+        )
+        inner[placed] = False
+    if d.layer.any():  # inner vertices have made room for layers
+        return
     kept = np.flatnonzero(inner[g.corners])
     x, own = d.vertices[g.corners[kept]], g.cells[kept]
     # Parts of cells that have been cut come last, with their centroids as generators.

@@ -364,7 +364,7 @@ def rebuild(diagram: Diagram) -> dict[str, np.ndarray]:
     """Return the arrays of a diagram that follow from its corners: measures and centroids of faces, centroids."""
     with np.errstate(all="ignore"):  # the check reports numbers that are not finite
         g = Rebuilt(diagram)
-        warped = diagram.domain.curved_walls  # faces at the walls of a solid are not plane
+        warped = diagram.has_moved_vertices  # then faces are not plane
         centroids = diagram.faces.measures.geometry.centroids if warped else g.centroids + diagram.points
     return {"face_measures": g.measures, "face_centroids": g.middles + diagram.points[g.owner], "centroids": centroids}
 
