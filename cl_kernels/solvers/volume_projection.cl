@@ -89,8 +89,8 @@ typedef struct {
      own[i] = dr_i/dx_i h_i      rows[k] = dr_i/dx_j h_j      columns[k] = dr_j/dx_i h_i   for face k = (i, j)
      r = b = log_ratio + J displacement      z = start if `warm`, else D^-1 r
 
-   together with eps and D^-1. From the log ratios their mean is subtracted if `mean_groups` is not 0: the sums of
-   `sum_log_ratio` over so many groups are in `mean_partial`. rows and columns have one array of `room` entries per
+   together with eps and D^-1. From the log ratios their mean is subtracted if `mean_groups` is not 0, the number of
+   groups whose sums, of `sum_log_ratio`, are in `mean_partial`. rows and columns have one array of `room` entries per
    component; entries of walls are 0. Generators with labels below `fixed` do not move. Lengths are divided by h before
    they are rounded, so that sizes of any magnitude are in range. */
 inline void assemble_rows(ITERATION_ARGS, ASSEMBLY_ARGS PERIOD_ARGS, group_t group)

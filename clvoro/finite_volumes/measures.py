@@ -17,7 +17,8 @@ if TYPE_CHECKING:
     from ..mesh.faces import Faces
 
 PLANAR_COSINE = 1e-6
-"""Two faces of a cell are concave if a center is nearer to the other's plane than this, over the distance of both."""
+"""Least distance of the center of a face from the plane of another face of its cell, over the distance of both centers;
+else the two faces are concave."""
 _TINY = 1e-150
 _CHUNK = 1 << 13
 """Faces that are read at a time: their arrays fit the caches."""

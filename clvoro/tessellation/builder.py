@@ -95,7 +95,7 @@ class CellBuilder(ABC):
             Reject generators so close together that round-off makes more than `EXACT_SHARE` of a cell uncertain;
             otherwise more than `ROUGH_SHARE`.
         rows : int, optional
-            Build the cells of only so many of the first rows of `part`; by default those of ghosts, too. Faces between
+            Number of first rows of `part` whose cells are built; by default all, those of ghosts, too. Faces between
             cells that are built and others are not matched.
 
         Raises

@@ -14,7 +14,7 @@ HARMLESS = DOUBT | NARROW | UNEVEN
 
 
 def with_room(clipped: Iterable[int], most: int) -> list[int]:
-    """Return the sizes of the launches of the next update, if this one has `clipped` so many cells in each round.
+    """Return the sizes of the launches of the next update from the cells `clipped` in each round of this one.
 
     The host must guess them. No round is larger than the one before.
     """

@@ -20,26 +20,26 @@ from .mend import rejected_at_walls, with_neighbors
 from .wall_surface import WallSurface
 
 _SNAPS = (0.1, 0.03)
-"""Vertices nearer to the plane of a cut than this, over h, count as in it. The second is tried if the first fails."""
+"""Distances over h up to which vertices count as in the plane of a cut. The second is tried if the first fails."""
 _REFLEX = 2.0
-"""A cell is concave at an edge if its angle there is more than this beyond 180 degrees."""
+"""Degrees beyond 180 from which the angle of a cell at an edge counts as concave."""
 _EDGES = 3
 """Most concave edges of a cell that are tried."""
 _LEAST_GAIN = 0.05
 """Where no fewer cells are rejected, a change is kept if their excess, see `judge`, falls by more than this."""
 _FOLDED = 100.0
-"""Faces of a cell are folded onto each other if the angle between them is more than this beyond 180 degrees."""
+"""Degrees beyond 180 from which the angle between two faces of a cell counts as folded."""
 _SHORT = 0.25
-"""Edges shorter than this, over h, may be collapsed, and faces with all corners nearer to their mean."""
+"""Length over h below which edges may be collapsed, and faces whose corners are all that near to their mean."""
 _SMALL = 0.4
 """Cells with a smaller volume, over h^3, may be merged with a neighbor; new parts of cells always may."""
 _REACH = 0.3
-"""A vertex may be moved onto a crease or corner that is nearer than this, over h."""
+"""Largest distance over h of a crease or corner onto which a vertex may be moved."""
 _SLIVER, _TIP, _FEW = 0.05, 0.4, 4
 """Cells at walls with a volume below `_SLIVER`, over h^3, may be left out; below `_TIP` with fewer than `_FEW` faces to
 others. So may up to `_FEW` cells without faces to others."""
 _TOO_MANY = 0.2
-"""Where more than this share of the cells are rejected, the solid is as thin as a cell, and no cure is tried."""
+"""Share of rejected cells above which no cure is tried: the solid is as thin as a cell."""
 _BUDGET, _MOST = 12, 1000
 """Most changes of a rejected cell before others have their turn, and most searches for cures in attempts that follow
 one another."""

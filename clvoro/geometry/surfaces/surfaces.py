@@ -36,7 +36,7 @@ _FLAT = 1 - 1e-9
 _ON_WALL = 1e-7
 """Triangles whose corners are this near to the walls, over the domain's extent, lie on them."""
 _SMALL = 1e-3
-"""Faces smaller than this, over the 2/3 power of the smaller cell's volume, do not connect regions."""
+"""Area over the 2/3 power of the smaller cell's volume below which a face does not connect regions."""
 
 
 class Surfaces(Borders):

@@ -11,7 +11,7 @@ import numpy as np
 import clvoro
 from clvoro import sizing
 
-N, PARTS = 2000, 8
+N, PARTS = 1200, 8
 turn = 2 * np.pi / PARTS
 axis = np.array([np.sin(0.6), 0, np.cos(0.6)])
 

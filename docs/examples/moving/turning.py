@@ -12,7 +12,7 @@ import numpy as np
 import clvoro
 from clvoro import sizing
 
-N, PARTS = 1500, 24
+N, PARTS = 1000, 18
 turn = 2 * np.pi / PARTS
 
 # %%

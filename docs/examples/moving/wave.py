@@ -12,7 +12,7 @@ import numpy as np
 import clvoro
 from clvoro import sizing
 
-N, PARTS, PART = 2000, 3, 2 * 3600.0
+N, PARTS, PART = 1600, 3, 2 * 3600.0
 GRAVITY, ROTATION, DEPTH = 9.80616, 7.292e-5, 4000.0
 globe = clvoro.Sphere(6.37122e6)
 
