@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import shlex
 import signal
 import sys
@@ -61,7 +62,7 @@ class Job:
     out : Path
         Folder for the files; created if needed.
     device : str or None
-        As `clvoro.create_context` takes it. Several devices, separated by commas, share the run.
+        As `clvoro.create_context` takes it. Several devices, separated by commas without blanks, share the run.
     report : bool
         Whether to draw pictures and write `report.html`.
     mesh_formats : tuple of str
@@ -195,11 +196,16 @@ class Job:
     def _make_adapter(self) -> Any:
         from .. import Adapter, create_context
 
-        dtype, names = self.case.run.get("dtype", "float64"), (self.device or "").split(",")
+        dtype, names = self.case.run.get("dtype", "float64"), self._devices
         if len(names) > 1:
             return Adapter(dtype=dtype, devices=names, share_gpus=self.share_gpus)
         context = create_context(self.device, fp64=dtype == "float64", comm=self.peers)
         return Adapter(context, dtype, self.peers, self.share_gpus)
+
+    @property
+    def _devices(self) -> list[str]:
+        """The devices that share the run. A comma before a blank is part of a name."""
+        return re.split(",(?! )", self.device or "")
 
     def _refuse_pieces(self) -> None:
         """Raise an error if ranks cannot share the run, or if its files cannot be written in pieces."""
@@ -210,8 +216,7 @@ class Job:
                     "--pieces out"
                 )
             return
-        devices = (self.device or "").count(",") + 1
-        for number, what in ((self.case.frames, "frames"), (devices, "devices")):
+        for number, what in ((self.case.frames, "frames"), (len(self._devices), "devices")):
             if number > 1:
                 raise InputError(
                     f"{self.case.name}: the run has {number} {what}, expected one, since ranks share it; run it "

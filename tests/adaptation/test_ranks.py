@@ -472,6 +472,7 @@ def test_what_the_command_refuses_over_ranks(tmp_path, monkeypatch):
     for changed, what in ((load_case("spots"), None), "32 frames"), ((case, "0:0,0:1"), "2 devices"):
         with pytest.raises(InputError, match=f"has {what}, expected one"):
             Job(changed[0], tmp_path, changed[1], peers=ranks)._refuse_pieces()
+    Job(case, tmp_path, "a processor, in two words", peers=ranks)._refuse_pieces()
 
     monkeypatch.setenv("PMI_SIZE", "2")
     mpi4py = types.ModuleType("mpi4py")
