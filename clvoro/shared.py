@@ -10,6 +10,8 @@ from typing import Concatenate, ParamSpec, TypeVar
 
 from .adapter import Adapter
 from .errors import DeviceError
+from .io import READERS
+from .io.vtu_read import load_pvtu
 
 Arguments = ParamSpec("Arguments")
 Answer = TypeVar("Answer")
@@ -52,3 +54,5 @@ adapt = _by_all("adapt", Adapter.run)
 voronoi = _by_all("voronoi", Adapter.diagram)
 power_diagram = _by_all("power_diagram", Adapter.power_diagram)
 transport = _by_all("transport", Adapter.transport)
+
+READERS[".pvtu"] = functools.partial(load_pvtu, tessellate=voronoi)

@@ -213,7 +213,7 @@ def _add_convert(commands: Any) -> None:
         ".vtu, .npz, .foam (or a folder polyMesh), .nc, .info (METIS), .info.part.N (its parts), .vtk, .ply, .obj.",
     )
     convert.set_defaults(work=_convert)
-    convert.add_argument("mesh", metavar="MESH", help="mesh.npz, mesh.vtu, or mesh.nc on a sphere")
+    convert.add_argument("mesh", metavar="MESH", help="mesh.npz, mesh.vtu, mesh.pvtu, or mesh.nc on a sphere")
     convert.add_argument("out", metavar="OUT", type=_path, help="file to write")
     convert.add_argument(
         "--convention", choices=("ugrid", "mpas", "scrip"), help="content of a .nc file (default: ugrid)"
@@ -494,9 +494,11 @@ def _readable(name: str) -> str:
     from ..io.foam_read import refuse_polymesh
 
     refuse_polymesh(name)
-    if Path(name).suffix.lower() not in (".npz", ".vtu", ".nc"):
+    if Path(name).suffix.lower() not in (".npz", ".vtu", ".pvtu", ".nc"):
         what = "is no mesh" if Path(name).exists() else "does not exist"
-        raise InputError(f"{name} {what}, expected a .npz, .vtu or .nc file (to check, also .foam or a case's folder)")
+        raise InputError(
+            f"{name} {what}, expected a .npz, .vtu, .pvtu or .nc file (to check, also .foam or a case's folder)"
+        )
     return name
 
 

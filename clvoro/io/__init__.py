@@ -34,15 +34,18 @@ __all__ = ["Disv", "DisvBoundary", "check_writable", "load", "make_folder", "sav
 CONVENTIONS: dict[str, Callable[[Contents, Path, str], None]] = {"ugrid": write_ugrid}
 """Writers of ``.nc`` files; `earth` adds those of its models."""
 READERS: dict[str, Callable[[str | PathLike[str]], Result | Diagram]] = {".vtu": load_vtu}
-"""Readers by suffix, besides that of ``.npz``; `earth` adds ``.nc``."""
+"""Readers by suffix, besides that of ``.npz``; `earth` adds ``.nc``, and `shared` ``.pvtu``."""
 
 
 def load(path: str | PathLike[str]) -> Result | Diagram:
-    """Read a result or a diagram from a ``.npz`` or ``.vtu`` file of its `save`, or a mesh on a sphere from ``.nc``.
+    """Read a result or a diagram from a ``.npz``, ``.vtu`` or ``.pvtu`` file of its `save`, or a sphere from ``.nc``.
 
     A ``.npz`` file holds everything. A ``.vtu`` file holds domain, cells, neighbors, sizes, errors and quality: other
     measures are computed again, and the history is empty. The file is not trusted: nothing in it is executed, sizes are
     compared with the bytes in the file before memory is allocated, and arrays must be consistent.
+
+    A ``.pvtu`` file and its pieces hold the mesh of all ranks. Cells are made again on the best device, and are in the
+    order of ranks.
 
     A ``.nc`` file of a mesh on a sphere may also be of another program. Generators, cells, neighbors and the generators
     behind a boundary are those that were saved, up to round-off; the boundary has one name, and corners may have other

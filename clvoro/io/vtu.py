@@ -93,10 +93,15 @@ _"""
         file.write(b"\n</AppendedData>\n</VTKFile>\n")
 
 
+DOMAIN = " clvoro domain: "
+"""What precedes the domain of the whole mesh in a comment of the index."""
+
+
 def write_pvtu(contents: Contents, path: Path) -> None:
     """Write the mesh of all ranks for ParaView: each rank its cells to a file ``NAME_0.vtu``, ..., rank 0 their index.
 
-    The mesh of a single process has one piece. Marks of named boundaries, which ranks do not share, are in pieces only.
+    `load` reads the whole mesh. The mesh of a single process has one piece. Marks of named boundaries, which ranks do
+    not share, are in pieces only.
     """
     parts = None if contents.result is None else contents.result.parts
     number, count = (0, 1) if parts is None else (parts.number, parts.count)
@@ -113,8 +118,10 @@ def write_pvtu(contents: Contents, path: Path) -> None:
     shapes = {name: a[:0] for name, a in cell_data(contents).items() if not name.startswith("boundary:")}
     data = [_PLACE.sub("", declared.add(name, a)).replace("DataArray", "PDataArray") for name, a in shapes.items()]
     sources = [f"<Piece Source={quoteattr(piece)}/>" for piece in pieces]
+    domain = json.dumps(describe(contents.diagram.domain if parts is None else parts.domain))
     text = f"""<?xml version="1.0"?>
 <VTKFile type="PUnstructuredGrid" version="1.0" byte_order="{sys.byteorder.title()}Endian" header_type="UInt64">
+<!--{DOMAIN}{domain.replace("--", "-" + chr(92) + "u002d")}-->
 <PUnstructuredGrid GhostLevel="0">
 <PPoints>
 <PDataArray type="Float64" NumberOfComponents="3"/>

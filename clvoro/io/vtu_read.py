@@ -8,16 +8,19 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import struct
 import sys
 import zlib
 from array import array
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from io import BufferedReader
 from itertools import pairwise
 from os import PathLike
+from pathlib import Path
 from typing import NoReturn
 from xml.parsers import expat
+from xml.sax.saxutils import unescape
 
 import numpy as np
 
@@ -29,13 +32,15 @@ from ..mesh.diagram import Diagram
 from ..mesh.results import Result, result_of_file
 from .arrays import EXPANSION, LEAST, FileError, explained
 from .contents import described
-from .vtu import KINDS, SOLVER_MESH
+from .vtu import DOMAIN, KINDS, SOLVER_MESH
 
 LONGEST_HEAD = 1 << 22
 MARK = b'<AppendedData encoding="raw">\n_'
 END = b"\n</AppendedData>\n</VTKFile>\n"
 _TYPES = {"Float64": "f8", "Float32": "f4", "Int32": "i4", "Int64": "i8", "UInt8": "u1"}
 _BLOCK = 1 << 20
+_SAME_VOLUME = 1e-3
+"""Largest relative difference of a volume that is read and computed, also in single precision."""
 _USED = {
     "Points.",
     "Cells.types",
@@ -192,6 +197,33 @@ def load_vtu(path: str | PathLike[str]) -> Result | Diagram:
         with open_plain(path) as file:
             arrays = _open(file).read_all(file)
         return _assemble(arrays)
+
+
+def load_pvtu(path: str | PathLike[str], tessellate: Callable[[Domain, np.ndarray], Diagram]) -> Result | Diagram:
+    """Read the mesh of all ranks from a `.pvtu` file of `Result.save` and its pieces, rank by rank.
+
+    Generators, sizes, errors and quality are those of the pieces. `tessellate` makes the cells again, since walls bound
+    those of a piece. The mesh of a single process is its piece.
+    """
+    with explained(path, "a .pvtu file that save wrote"):
+        with open_plain(path) as file:
+            text = file.read(LONGEST_HEAD).decode()
+        sources = [unescape(name[1:-1], {"&quot;": '"'}) for name in re.findall("<Piece Source=(.*)/>", text)]
+        said = re.search(f"<!--{DOMAIN}(.*)-->", text)
+        if said is None or not sources or any(Path(name).name != name for name in sources):
+            raise FileError("it has no domain, or no pieces beside it; it is not from clvoro, or an earlier version")
+        pieces = [load_vtu(Path(path).with_name(name)) for name in sources]
+        if len(pieces) == 1:
+            return pieces[0]
+        results = [piece for piece in pieces if isinstance(piece, Result)]
+        points, volumes, *fields = (
+            np.concatenate([getattr(piece, name) for piece in results])
+            for name in ("points", "volumes", "target_size", "size_error", "quality")
+        )
+        diagram = tessellate(described(json.loads(said[1])), points)
+        if not np.allclose(diagram.volumes, volumes, rtol=_SAME_VOLUME):
+            raise FileError("its pieces are not those of one mesh; save it again")
+        return result_of_file(diagram, *fields, ".pvtu")
 
 
 def cell_data_of_vtu(path: str | PathLike[str]) -> dict[str, np.ndarray] | None:

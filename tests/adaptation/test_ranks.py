@@ -182,6 +182,10 @@ def test_a_run_in_parts_of_a_periodic_box(ctx, tmp_path):
     assert whole.check()
     assert whole.history["step"][-1] == 20
     assert whole.history["mean_quality"][-1] > 0.9
+    assert clvoro.load(tmp_path / "mesh.pvtu").check()
+    (tmp_path / "mesh_0.vtu").write_bytes((tmp_path / "mesh_1.vtu").read_bytes())
+    with pytest.raises(InputError, match=r"mesh\.pvtu"):
+        clvoro.load(tmp_path / "mesh.pvtu")
     for mesh in meshes:
         assert mesh.domain.measure == pytest.approx(mesh.volumes.sum())
         assert not any(len(mesh.boundary_cells(name)) for name in mesh.domain.boundary_names if "rank" not in name)
@@ -236,6 +240,13 @@ def test_a_run_in_parts(ctx, kind, tmp_path):
         cells = tmp_path / f"case/processor{number}/constant/polyMesh/cellProcAddressing"
         assert f"\n{size}\n(" in cells.read_text()
 
+    loaded = clvoro.load(tmp_path / "mesh.pvtu")
+    assert loaded.check()
+    assert loaded.diagram.domain == domain
+    for array in ("points", "size_error", "quality"):
+        assert np.allclose(
+            getattr(loaded, array), np.concatenate([getattr(mesh, array) for mesh in meshes]), atol=1e-12
+        )
     pyvista = pytest.importorskip("pyvista")
     read = pyvista.read(tmp_path / "mesh.pvtu")
     assert read.n_cells == len(whole)
