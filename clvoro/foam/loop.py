@@ -474,6 +474,8 @@ class _Loop:
             given = given.diagram
         if given is None:
             domain = foam.domain()
+            if domain.dim == 3:
+                return foam.diagram(domain)
             with warnings.catch_warnings():
                 # The solver uses the mesh of the case, and not this diagram.
                 warnings.simplefilter("ignore", MismatchWarning)

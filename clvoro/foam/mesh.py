@@ -10,12 +10,15 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import InputError
+from ..finite_volumes.solid_walls.mesh import diagram_of
 from ..geometry.domain import Domain
 from ..geometry.polygon import Polygon
 from ..geometry.rings import signed_area
 from ..geometry.solid.solid import Solid
 from ..io.arrays import FileError, explained
 from ..io.foam_read import FoamFile, FoamPatchFaces, count_cells
+from ..mesh.diagram import Diagram
+from ..mesh.faces import Faces
 from ..mesh.geometry import cell_geometry, face_geometry
 from .case import has_file
 
@@ -147,7 +150,8 @@ class FoamMesh:
         if other:
             raise InputError(
                 f"the case has patches {', '.join(other)}, expected types {', '.join(known)}, or one layer of cells "
-                "between empty patches; cyclic patches are known if the mesh is one of clvoro that is passed as mesh="
+                "between empty patches; wedges, baffles and other pairs of patches cannot be adapted, cyclic "
+                "seams can if clvoro made the mesh: pass it as mesh="
             )
         if self.is_plane:
             return self._polygon()
@@ -158,6 +162,21 @@ class FoamMesh:
                 'the case, from y by transformPoints -rotate "((0 1 0) (0 0 1))" -rotateFields'
             )
         return self._solid()
+
+    def diagram(self, domain: Domain) -> Diagram:
+        """Return the mesh in space as a diagram: its generators are the centroids of the cells."""
+        names = list(domain.boundary_names)
+        neighbor = np.full(len(self.owner), -1)
+        neighbor[: len(self.neighbor)] = self.neighbor
+        for patch in self.patches:
+            if len(patch.faces):
+                neighbor[patch.faces] = -1 - np.flatnonzero(domain.boundary_index == names.index(patch.name))[0]
+        none, still = np.full(len(neighbor), -1), np.zeros((len(neighbor), 3), np.int8)
+        return diagram_of(
+            Faces(
+                domain, self.centroids, self.points, self.starts, self.corners, self.owner, neighbor, none, still, none
+            )
+        )
 
     def _polygon(self) -> Polygon:
         ends, names = [], []
@@ -207,6 +226,10 @@ def polygon_of_edges(points: np.ndarray, ends: np.ndarray, names: list[str]) -> 
     InputError
         If they do not close.
     """
+    # Both sides of a baffle have vertices of their own at the same points.
+    grid = (points / (1e-9 * np.ptp(points, axis=0).max())).round()
+    _, first, same = np.unique(grid, axis=0, return_index=True, return_inverse=True)
+    ends = first[same.reshape(-1)[ends]]
     at: dict[int, list[int]] = {}
     for k, pair in enumerate(ends.tolist()):
         for v in pair:
@@ -214,7 +237,10 @@ def polygon_of_edges(points: np.ndarray, ends: np.ndarray, names: list[str]) -> 
     open_ends = [v for v, edges in at.items() if len(edges) != 2]
     if open_ends:
         x, y = points[open_ends[0]]
-        raise InputError(f"the boundary is not closed, or touches itself, at ({x:g}, {y:g}); pass mesh=")
+        raise InputError(
+            f"the boundary is not closed, or touches itself, at ({x:g}, {y:g}), expected rings; a baffle without "
+            "thickness cannot be adapted"
+        )
     left, rings = set(range(len(ends))), []
     while left:
         edge = min(left)

@@ -289,9 +289,8 @@ def _flux(field: FoamField, velocity: FoamField, mesh: FoamMesh) -> FoamField:
     flux = project_fluxes(mesh, velocity.internal.rows(mesh.n_cells), *_at_boundary(velocity, mesh))
     boundary: Entries = {}
     for patch in mesh.patches:
-        if patch.kind == "empty":
-            boundary[patch.name] = {"type": b"empty", "value": Values("scalar", np.zeros((0, 1)), False)}
-        else:
-            boundary[patch.name] = {"type": b"calculated", "value": Values("scalar", flux[patch.faces, None], False)}
+        kind = patch.kind if patch.kind.startswith(("empty", "symmetry")) else "calculated"
+        through = flux[patch.faces[: 0 if kind == "empty" else None], None]
+        boundary[patch.name] = {"type": kind.encode(), "value": Values("scalar", through, False)}
     internal = Values("scalar", flux[:inner, None], False)
     return replace(field, entries={**field.entries, "internalField": internal, "boundaryField": boundary})

@@ -224,6 +224,7 @@ def test_one_cycle(case, known):
     every += [flux.patches[patch.name]["value"].numbers[:, 0] for patch in mesh.patches if patch.kind != "empty"]
     phi = np.concatenate([*every, np.zeros(2 * mesh.n_cells)])
     assert divergence(mesh, phi) < MOST_DIVERGENCE
+    assert flux.patches["body"]["type"] == b"symmetry"  # as OpenFOAM wants it
     assert phi[inlet].sum() == pytest.approx((given * mesh.faces[1][inlet]).sum(), rel=1e-12)
     sizes = np.sqrt(clvoro.load(folder / "clvoro.npz").volumes)
     x = mesh.centroids
@@ -585,7 +586,7 @@ def test_iterations_project_fluxes_as_a_factorization_does(template, monkeypatch
 
 
 def test_polygons_of_edges():
-    """Straight runs of a name become one edge, holes stay, and open boundaries are refused."""
+    """Straight runs of a name become one edge, holes stay; open boundaries and baffles are refused."""
     points = np.array([(0, 0), (1, 0), (2, 0), (2, 2), (0, 2), (0.5, 0.5), (1, 1), (0.5, 1)])
     ends = np.array([(0, 1), (2, 1), (2, 3), (3, 4), (4, 0), (5, 6), (6, 7), (7, 5)])
     polygon = polygon_of_edges(points, ends, ["low", "low", "right", "top", "top", *["hole"] * 3])
@@ -594,6 +595,9 @@ def test_polygons_of_edges():
     assert set(polygon.boundary_names) == {"low", "right", "top", "hole"}
     with pytest.raises(InputError, match="not closed"):
         polygon_of_edges(points, ends[1:], ["a"] * 7)
+    points = np.array([(0, 0), (1, 0), (1, 1), (0, 1), (0.5, 0.5), (0, 0)])  # a baffle, whose sides have their own foot
+    with pytest.raises(InputError, match=r"touches itself, at \(0, 0\)"):
+        polygon_of_edges(points, np.array([(0, 1), (1, 2), (2, 3), (3, 5), (5, 4), (4, 0)]), ["a"] * 6)
 
 
 PERIODIC = clvoro.Box((0, 0), (1, 1), (True, False))
