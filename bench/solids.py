@@ -1,7 +1,7 @@
 """Meshes of solids, and what OpenFOAM says: `checkMesh -allGeometry -allTopology` for CAD-like parts.
 
     python bench/solids.py [--only NAMES] [--runs NAMES] [--seeds N] [--resolutions NUMBERS] [--booleans N]
-                           [--cells N] [--limit SECONDS] [--speed NUMBERS] [--domains NAMES] [--order SIZES]
+                           [--first N] [--cells N] [--limit SECONDS] [--speed NUMBERS] [--domains NAMES] [--order SIZES]
                            [--layers THICKNESS:COUNT:GROWTH,...] [--surfaces] [--keep FOLDER]
                            [--pictures FOLDER] [--device NAME] [--dtype float32] [--json]
 
@@ -16,10 +16,10 @@ mesh with its faces, and of the mesh for solvers. Memory is the most up to then 
 chooses some of the three. `--order SIZES` compares volume and wall area of a ball, a torus and a cylinder with those of
 their surface, and its distance from the vertices of walls with h^2 times the curvature.
 
-With `--booleans N` the solids are N random booleans of boxes, balls and cylinders, or those whose numbers `--only`
-lists, with about `--cells` cells each, in a process that may crash or hang. Each is accepted, rejected, refused (by a
-message, before there is a mesh), or it fails: an exception, a crash, no end within the limit, a cell that is not
-closed, or walls that are off by more than 0.1 h in the mean.
+With `--booleans N` the solids are N random booleans of boxes, balls and cylinders, from number `--first` on, or those
+whose numbers `--only` lists, with about `--cells` cells each, in a process that may crash or hang. Each is accepted,
+rejected, refused (by a message, before there is a mesh), or it fails: an exception, a crash, no end within the limit, a
+cell that is not closed, or walls that are off by more than 0.1 h in the mean. Seconds and the limit are processor time.
 With `--layers` all patches of the solids have layers of prisms, such as `0.5:5:1.3`: 0.5 h thick, five layers, growth
 1.3. A row has the inner cells and the prisms, the mean thickness over the one given at the vertices of walls, the
 share of these with at least 0.9 of it, the mean first height where it is at least 0.9 of the one given, and the
@@ -32,8 +32,10 @@ Pictures show each mesh cut open, with the patches or the regions in colors.
 from __future__ import annotations
 
 import argparse
+import math
 import multiprocessing
 import resource
+import signal
 import tempfile
 import time
 import traceback
@@ -138,7 +140,9 @@ def measure_boolean(adapter: clvoro.Adapter, number: int, cells: int) -> dict[st
         h = (solid.measure / cells) ** (1 / 3)
         with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
+            begin = time.process_time()
             row = measure(adapter, solid, h, Path(folder))
+            row["seconds"] = time.process_time() - begin
     except ClvoroError as error:
         return {"verdict": "refused", "complaints": str(error)}
     except Exception:
@@ -165,13 +169,15 @@ def _serve(numbers: Any, options: argparse.Namespace) -> None:
     """Measure the random solids whose numbers come through a pipe, in a process of its own."""
     adapter = make_adapter(options)
     while True:
-        numbers.send(measure_boolean(adapter, numbers.recv(), options.cells))
+        number, used = numbers.recv(), resource.getrusage(resource.RUSAGE_SELF)
+        resource.setrlimit(resource.RLIMIT_CPU, (math.ceil(used.ru_utime + used.ru_stime + options.limit), -1))
+        numbers.send(measure_boolean(adapter, number, options.cells))
 
 
 def measure_booleans(options: argparse.Namespace, report: Report) -> str:
     """Add a row for each random solid, and return how many have each verdict."""
     context, worker, pipe = multiprocessing.get_context("spawn"), None, None
-    for number in counts(options.only) or range(options.booleans):
+    for number in counts(options.only) or range(options.first, options.first + options.booleans):
         if worker is None or pipe is None:
             pipe, end = context.Pipe()
             worker = context.Process(target=_serve, args=(end, options), daemon=True)
@@ -180,14 +186,12 @@ def measure_booleans(options: argparse.Namespace, report: Report) -> str:
         row: dict[str, Any] = {"solid": number, "cells": 0, **dict.fromkeys(_EMPTY, float("nan"))}
         pipe.send(number)
         try:
-            if pipe.poll(options.limit):
-                row |= pipe.recv()
-            else:
-                row |= {"verdict": "failed", "complaints": f"no end within {options.limit} s"}
+            row |= pipe.recv()
         except EOFError:
-            row |= {"verdict": "failed", "complaints": "the process crashed"}
-        if row["verdict"] == "failed":
-            worker.kill()
+            worker.join()
+            late = worker.exitcode == -signal.SIGXCPU
+            what = f"no end within {options.limit:g} s of processor time" if late else "the process crashed"
+            row |= {"verdict": "failed", "complaints": what}
             worker = None
         report.add(row, f"{number}: {row['verdict']} {row['complaints'][:160]}")
     verdicts = [row["verdict"] for row in report.records]
@@ -405,8 +409,11 @@ def main() -> None:
     options_of.add_argument("--seeds", type=int, default=0, metavar="N", help="one run with each of 1 to N")
     options_of.add_argument("--resolutions", default="0,1", metavar="NUMBERS", help="0: coarse, 1: fine")
     options_of.add_argument("--booleans", type=int, default=0, metavar="N", help="random solids in place of those")
+    options_of.add_argument("--first", type=int, default=0, metavar="N", help="number of the first random solid")
     options_of.add_argument("--cells", type=int, default=1500, metavar="N", help="of each random solid, about")
-    options_of.add_argument("--limit", type=float, default=300, metavar="SECONDS", help="for each random solid")
+    options_of.add_argument(
+        "--limit", type=float, default=300, metavar="SECONDS", help="processor time for each random solid"
+    )
     options_of.add_argument("--speed", default="", metavar="NUMBERS", help="processor times of so many cells")
     options_of.add_argument("--keep", type=Path, metavar="FOLDER", help="keep the cases, with checkMesh.log")
     options_of.add_argument("--pictures", type=Path, metavar="FOLDER")

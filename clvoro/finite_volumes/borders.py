@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 
@@ -17,7 +16,7 @@ from ..mesh.diagram import Diagram
 from ..mesh.faces import Faces
 from ..mesh.geometry import sum_rows
 from .collapse import collapse_short
-from .moves import fewest_rejected, moved
+from .moves import FEW, MOVES, fewest_rejected, moved
 from .solid_walls.mend import NARROW, cells_of, narrow_faces, rejected_among, with_neighbors
 from .solid_walls.mesh import diagram_of
 
@@ -87,8 +86,8 @@ def on_surfaces(
     def depth(x: np.ndarray) -> np.ndarray:
         return np.where(domain.contains(x), domain.boundary_distance(x), -1.0)
 
-    def again(points: np.ndarray, rows: np.ndarray, best: _OnSurfaces, move: int) -> _OnSurfaces | None:
-        del rows, best, move
+    def again(points: np.ndarray, last: _OnSurfaces) -> _OnSurfaces | None:
+        del last
         try:
             return _made(remake(points), sheets)
         except InputError:
@@ -96,9 +95,11 @@ def on_surfaces(
 
     points, own = points.copy(), slice(None) if diagram.home is None else diagram.home >= 0
     points[first.home[own]] = diagram.points[own]
-    return fewest_rejected(
-        first, points, sizes, lambda a: a.home[a.rejected], partial(moved, domain, depth, sizes, held=held), again
-    ).diagram
+
+    def change(points: np.ndarray, rows: np.ndarray, move: int) -> np.ndarray:
+        return moved(domain, depth, sizes, points, rows, move, held) if len(rows) <= FEW * len(points) else points
+
+    return fewest_rejected(first, points, sizes, lambda a: a.home[a.rejected], change, again, MOVES).diagram
 
 
 def _made(diagram: Diagram, sheets: Sheets) -> _OnSurfaces:

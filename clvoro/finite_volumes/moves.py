@@ -16,11 +16,12 @@ from ..mesh.connectivity import distinct
 T = TypeVar("T")
 FEW = 0.03
 """Largest share of generators with rejected cells for which meshes are made again, and of generators without cells."""
-_MOVES = 4
-"""Largest number of attempts to move the generators of rejected cells."""
-_MOVE, _BESIDE = 0.15, 1.3
-"""Displacement of the generator of a rejected cell, and distance from it up to which others move as well, over h."""
-_GROUP = 4.0
+MOVES = 5
+"""Largest number of trials to move the generators of rejected cells."""
+_MOVE, _BESIDE = 0.05, 1.3
+"""Displacement of generators of rejected cells, which grows by this from trial to trial and is twice as much at first,
+and distance up to which others move as well, over h."""
+_GROUP = 2.5
 """Distance over h up to which rejected cells are in one group."""
 _DEEP = 0.1
 """Least distance of moved generators from the boundary of the domain, over h."""
@@ -34,51 +35,58 @@ _FREE = 0.9
 
 def fewest_rejected(
     first: T,
-    points: np.ndarray,
+    state: np.ndarray,
     sizes: np.ndarray,
     rejected: Callable[[T], np.ndarray],
-    shift: Callable[[np.ndarray, np.ndarray, int], np.ndarray],
-    remake: Callable[[np.ndarray, np.ndarray, T, int], T | None],
+    change: Callable[[np.ndarray, np.ndarray, int], np.ndarray],
+    remake: Callable[[np.ndarray, T], T | None],
+    trials: int,
 ) -> T:
-    """Move generators of rejected cells; return the mesh of the fewest rejected cells, the `first` or a later one.
+    """Change what a mesh is made of at rejected cells; return the mesh of the fewest rejected cells.
 
-    Rejected cells near each other are a group. If it has fewer of them after a move, the generators in it stay moved;
-    others move back.
+    Rejected cells near each other are a group. If it has fewer of them after a change, what changed in it stays;
+    all else is changed back.
 
     Parameters
     ----------
     first : object
-        The mesh of generators `points` (n, 3), for cells of the `sizes` (n,).
+        The mesh of `state` (n, k): the generators, (n, 3), and more columns of numbers if it depends on these.
+    sizes : (n,) float
+        h at the generators.
     rejected : callable
         Returns the generators of the rejected cells of a mesh, (k,) int; -1 for none.
-    shift : callable
-        Called with all generators, some rows (k,) int, and the number of the attempt. Returns all generators, with
-        those of the rows and beside them moved; see `moved`.
+    change : callable
+        Called with the state, some rows (k,) int, and the number of the trial. Returns a state with those rows
+        changed, and those beside them; or the same one, for which no mesh is made.
     remake : callable
-        Called with other generators (n, 3), the rows, the best mesh, and the number of the attempt. Returns the mesh of
-        these generators, or None, which ends the attempts.
+        Called with another state and the last mesh. Returns the mesh of that state, or None if there is none.
+    trials : int
+        Largest number of trials.
     """
-    best, bad = first, rejected(first)
-    for move in range(_MOVES):
-        bad = bad[bad >= 0]
-        rows = distinct(bad)
-        if not 0 < len(rows) <= FEW * len(points):
+    best, last, bad, points = first, first, rejected(first), state[:, :3]
+    for number in range(trials):
+        rows = distinct(bad[bad >= 0])
+        if not len(rows):
             break
-        trial = shift(points, rows, move)
-        if (made := remake(trial, rows, best, move)) is None:
-            break
-        new = rejected(made)
+        trial = change(state, rows, number)
+        if (trial == state).all():
+            continue
+        if (made := remake(trial, last)) is None:
+            continue
+        last, new = made, rejected(made)
         if len(new) < len(rejected(best)):
             best = made
-        new = new[new >= 0]
+        bad, new = bad[bad >= 0], new[new >= 0]
         count, group = _groups(points, sizes, np.concatenate([bad, new]))
         before, after = np.split(group, [len(bad)])
         fewer = np.bincount(after, minlength=count) < np.bincount(before, minlength=count)
-        changed = np.flatnonzero((trial != points).any(axis=1))
+        changed = np.flatnonzero((trial != state).any(axis=1))
         changed = changed[fewer[before[scipy.spatial.KDTree(points[bad]).query(points[changed])[1]]]]
-        points = points.copy()
-        points[changed] = trial[changed]
+        state = state.copy()
+        state[changed] = trial[changed]
         bad = np.concatenate([bad[~fewer[before]], new[fewer[after] | ~np.isin(after, before)]])
+    if len(bad) < len(rejected(best)) and (made := remake(state, last)) is not None:
+        best = min(best, made, key=lambda mesh: len(rejected(mesh)))
     return best
 
 
@@ -110,7 +118,7 @@ def moved(
     sizes : (n,) float
         h at the generators.
     move : int
-        The number of the attempt, which the random directions depend on.
+        The number of the trial, which the random directions depend on.
     held : int
         How many of the first generators stay.
     """
@@ -118,7 +126,7 @@ def moved(
     rows, points = np.unique(np.concatenate(beside).astype(np.int64)), points.copy()
     rows = rows[rows >= held]
     away = np.random.default_rng(move).normal(size=(len(rows), 3))
-    away *= (_MOVE * sizes[rows] / np.linalg.norm(away, axis=1))[:, None]
+    away *= ((2 + move) * _MOVE * sizes[rows] / np.linalg.norm(away, axis=1))[:, None]
     sheets = None if domain.borders is None else domain.borders.sheets
     group, room = np.arange(len(rows)), np.zeros(len(rows))
     if sheets is not None:

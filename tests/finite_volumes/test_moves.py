@@ -25,7 +25,7 @@ def test_generators_of_rejected_cells_are_moved_inside_of_the_solid():
         there = in_solid(solid, x, [0, 2, 3], move)
         away = np.linalg.norm(there - x, axis=1) / H
         assert away[1] == 0
-        assert all(a == 0 or a == pytest.approx(0.15) for a in away)
+        assert all(a == 0 or a == pytest.approx(0.1 + 0.05 * move) for a in away)
         assert (solid.signed_distance(there[away > 0]) < 0).all()
 
 
@@ -49,23 +49,29 @@ def test_pairs_stay_mirror_images_in_all_patches_between_them():
 
 
 def test_the_mesh_of_the_fewest_rejected_cells_is_kept():
-    """Generators of a group stay moved if it has fewer rejected cells; others move back. None ends the attempts."""
-    points = np.column_stack([np.arange(300) * 3.0, np.zeros((300, 2))])
-    meshes, begun = [[0, 1, 200, -1], [0, 200], [0, 0, 0], None], []
+    """What changed in a group stays if that has fewer rejected cells; all else is changed back."""
+    state = np.column_stack([np.arange(300) * 3.0, np.zeros((300, 3))])
+    begun, made = [], []
 
-    def shift(x, rows, move):
-        begun.append((np.flatnonzero(x[:, 1]).tolist(), rows.tolist(), move))
-        return x + np.isin(np.arange(300), rows)[:, None] * (0, 1, 0)
+    def change(now, rows, number):
+        begun.append((np.flatnonzero(now[:, 3]).tolist(), rows.tolist(), number))
+        return now + (number != 1) * np.isin(np.arange(300), rows)[:, None] * (0, 0, 0, 1)
 
-    def kept(first):
-        return fewest_rejected(first, points, np.ones(300), np.array, shift, lambda x, rows, best, k: meshes[k])
+    def kept(first, meshes):
+        meshes = iter(meshes)
 
-    assert kept([0, 1, 1, 100, 200]) == [0, 200]
+        def remake(now, last):
+            made.append((now[:, 3].sum(), last))
+            return next(meshes)
+
+        return fewest_rejected(first, state, np.ones(300), np.array, change, remake, 4)
+
+    first, better = [0, 1, 1, 100, 200], [0, 1, 200, -1]
+    assert kept(first, [better, [0, 0, 1, 200], None, [0, 1]]) == [0, 1]
     assert begun == [
         ([], [0, 1, 100, 200], 0),
-        ([0, 1, 100], [0, 1, 200], 1),
-        ([0, 1, 100], [0, 200], 2),
-        ([0, 1, 100, 200], [0], 3),
+        ([1, 100], [0, 1, 200], 1),
+        ([1, 100], [0, 1, 200], 2),
+        ([1, 100], [0, 1, 200], 3),
     ]
-    assert kept([*range(10)]) == [*range(10)]
-    assert kept([]) == []
+    assert kept([], []) == []

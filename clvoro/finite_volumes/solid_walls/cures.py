@@ -41,8 +41,8 @@ others. So may up to `_FEW` cells without faces to others."""
 _TOO_MANY = 0.2
 """Share of rejected cells above which no cure is tried: the solid is as thin as a cell."""
 _BUDGET, _MOST = 12, 1000
-"""Most changes of a rejected cell before others have their turn, and most searches for cures in attempts that follow
-one another."""
+"""Most changes of a rejected cell before others have their turn, and most searches for cures in meshes that are made
+one after another."""
 _AHEAD = 1
 """Where no cure of a cell helps, cures of the cells that OpenFOAM rejects after it may follow: how many in turn."""
 _BRANCHES, _MOST_BAD = 2, 3

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cache, partial
+from functools import cache
+from itertools import product
 
 import numpy as np
 import scipy
@@ -15,7 +16,7 @@ from ...mesh.connectivity import distinct, following, take_ranges, take_rows
 from ...mesh.diagram import Diagram
 from ...mesh.faces import Faces
 from ..collapse import collapse_short
-from ..moves import FEW, fewest_rejected, moved
+from ..moves import FEW, MOVES, fewest_rejected, moved
 from .chains import Crossings, cross_cells
 from .cures import Cures, cured
 from .mend import at_wall, changed_cells, narrow_faces, rejected_at_walls, touching_walls, with_neighbors
@@ -43,8 +44,13 @@ across it, over h."""
 _AROUND = 0.85
 """Generators nearer to a concave crease than this share of h stay: the faces between their cells meet in it."""
 _GOLDEN = (5**0.5 - 1) / 2
-_PATIENCE, _ATTEMPTS = 3, 8
-"""How often a mesh is made again without fewer rejected cells than before, and at all."""
+_TRIALS = [(0, FILLED), (0, ROUNDED), (0, ROUNDED + 1), *product(range(1, 1 + MOVES), (EXACT, ROUNDED + 1))]
+"""The trials where cells are rejected: how often generators have moved, and how walls are made; with `ROUNDED + 1` also
+those of cells beside the rejected ones."""
+_BESIDE = 1.3
+"""How near these are, over h."""
+_CREASED = 3.0
+"""Walls of a cell farther from all creases than this, over h, are the same however they are made."""
 _MISSED = 0.1
 """A crossing of a crease becomes a vertex of a chord on its face that is farther from it than this share of h."""
 
@@ -55,6 +61,9 @@ class _Made:
 
     Attributes
     ----------
+    near : NearWalls
+    walls : (p + 1,) int
+        How the walls of each cell are made.
     faces : Faces
     home : (m,) int
         The cell of `NearWalls` that each one was.
@@ -67,6 +76,8 @@ class _Made:
         What has been done to the cells.
     """
 
+    near: NearWalls
+    walls: np.ndarray
     faces: Faces
     home: np.ndarray
     own: np.ndarray
@@ -180,33 +191,49 @@ def solid_diagram(
         With `warns`, if generators have no cell, cells are cut, leave out creases, or are concave. It says how many,
         and the first place.
     """
-    near = NearWalls.of(surface, points, sizes, whole(points))
-    last = _Attempts(surface, near, np.full(len(near.sizes), EXACT, np.int8), None, tell)
 
-    def again(points: np.ndarray, rows: np.ndarray, best: _Attempts, move: int) -> _Attempts | None:
-        nonlocal last
-        if last.are_spent:
+    def remake(state: np.ndarray, last: _Made | None) -> _Made | None:
+        points, near = state[:, :3], None if last is None else last.near
+        if last is not None and last.cures is not None and last.cures.are_spent:
             return None
-        near = NearWalls.of(surface, points, sizes, whole(points))
-        walls = np.full(len(points) + 1, EXACT, np.int8)
-        walls[best.near.numbers] = best.walls
-        walls[rows] = EXACT
+        if near is None or not np.array_equal(near.points, points):
+            near = NearWalls.of(surface, points, sizes, whole(points))
         try:
-            last = _Attempts(surface, near, walls[near.numbers], best.made.cures, tell, f", moved {move + 1}")
-        except InputError:
+            tell(f"walls of {len(near.rows)} cells")
+            raw = _Maker(surface, near, np.append(state[near.rows, 3], EXACT)).mesh()
+            _check_lost(surface, near, raw.home)
+        except InputError:  # a simpler cell of a thin part may be nothing
+            if last is None:
+                raise
             return None
-        return last
+        return _finished(surface, raw, None if last is None else last.cures, tell)
 
-    best = fewest_rejected(
-        last,
-        points,
-        sizes,
-        lambda a: a.near.numbers[a.made.home[a.made.rejected]],
-        partial(moved, surface.solid, lambda x: -surface.closest(x)[2], sizes, held=held),
-        again,
-    )
-    near = best.near
-    mesh, points = best.made, near.points
+    def change(state: np.ndarray, rows: np.ndarray, number: int) -> np.ndarray:
+        # First walls become simpler, then generators move, too.
+        move, level = _TRIALS[number]
+        if move and len(rows) > FEW * len(state):
+            return state
+        trial = state.copy()
+        if move:
+            trial[:, :3] = moved(surface.solid, depth, sizes, state[:, :3], rows, move - 1, held)
+        creased = rows[surface.nearest_crease(state[rows, :3], _CREASED * sizes[rows])[0] >= 0]
+        if level > ROUNDED:
+            beside = scipy.spatial.KDTree(points).query_ball_point(points[creased], _BESIDE * sizes[creased])
+            creased = np.array(sorted(set().union(*beside)), np.int64)
+        trial[creased, 3] = min(level, ROUNDED)
+        return trial if len(creased) or not level else state
+
+    def depth(x: np.ndarray) -> np.ndarray:
+        return -surface.closest(x)[2]
+
+    def rejected_generators(made: _Made) -> np.ndarray:
+        return made.near.numbers[made.home[made.rejected]]
+
+    state = np.column_stack([points, np.full(len(points), EXACT)])
+    first = remake(state, None)
+    assert first is not None
+    mesh = fewest_rejected(first, state, sizes, rejected_generators, change, remake, len(_TRIALS))
+    near, points = mesh.near, mesh.near.points
     rejected = mesh.faces.generators[mesh.rejected]
     tell("cells without walls")
     faces, home = near.put_back(mesh.faces, mesh.home, mesh.own)
@@ -215,7 +242,7 @@ def solid_diagram(
         (points[lost], "generators at {} have no cell: the solid is thinner than a cell, which is left out"),
         (points[-1 - home[home < 0]], "cells at {} are parts of others, cut where these were concave"),
         (
-            near.generators[best.walls >= FILLED],
+            near.generators[mesh.walls >= FILLED],
             "cells at {} leave out creases or corners, of which several meet within a cell",
         ),
         (rejected, "cells at {} are concave, inverted, or as thin as the solid, and OpenFOAM does not accept them"),
@@ -226,74 +253,6 @@ def solid_diagram(
     diagram = diagram_of(faces)
     diagram.home = home
     return diagram
-
-
-class _Attempts:
-    """The mesh of the fewest rejected cells of several, with ever simpler walls where cells are rejected.
-
-    Parameters
-    ----------
-    surface : WallSurface
-    near : NearWalls
-    walls : (p + 1,) int8
-        How the walls of each cell are made at first.
-    cures : Cures or None
-        Of an earlier mesh.
-    tell : callable
-        Called with the name of each part of the work, and `label`.
-
-    Attributes
-    ----------
-    near : NearWalls
-    made : _Made
-        The mesh.
-    walls : (p + 1,) int8
-        How its walls are made.
-    are_spent : bool
-        Whether there were so many rejected cells that no more are cured.
-
-    Raises
-    ------
-    InputError
-        If generators have no cell, as the solid is too thin there.
-    """
-
-    def __init__(
-        self,
-        surface: WallSurface,
-        near: NearWalls,
-        walls: np.ndarray,
-        cures: Cures | None,
-        tell: Callable[[str], object],
-        label: str = "",
-    ) -> None:
-        self.near = near
-        walls, best, since = walls.copy(), None, 0
-        for attempt in range(1, _ATTEMPTS + 1):
-            if since == _PATIENCE:
-                break
-            number = label if attempt == 1 else f"{label}, attempt {attempt}"
-            try:
-                tell(f"walls of {len(near.rows)} cells{number}")
-                raw = _Maker(surface, near, walls).mesh()
-                _check_lost(surface, near, raw.home)
-            except InputError:  # a simpler cell of a thin part may be nothing
-                if best is None:
-                    raise
-                break
-            made = _finished(surface, near, raw, cures, lambda part, number=number: tell(part + number))
-            cures, since = made.cures, since + 1
-            places = made.faces.generators[made.rejected]
-            if best is None or len(made.rejected) < len(best.rejected):
-                best, self.walls, since = made, walls.copy(), 0
-            elif (surface.nearest_crease(places, 3 * near.sizes[made.home[made.rejected]])[0] < 0).all():
-                break  # without creases there the next attempts are the same
-            self.are_spent = cures is not None and cures.are_spent
-            if not len(made.rejected) or self.are_spent:
-                break
-            _simplify(walls, near, np.unique(made.home[made.rejected]))
-        assert best is not None
-        self.made = best
 
 
 def _check_lost(surface: WallSurface, near: NearWalls, home: np.ndarray) -> None:
@@ -307,14 +266,12 @@ def _check_lost(surface: WallSurface, near: NearWalls, home: np.ndarray) -> None
         )
 
 
-def _finished(
-    surface: WallSurface, near: NearWalls, raw: _Made, earlier: Cures | None, tell: Callable[[str], object]
-) -> _Made:
+def _finished(surface: WallSurface, raw: _Made, earlier: Cures | None, tell: Callable[[str], object]) -> _Made:
     """Return `raw` cells near the surface without short edges and slivers, cured where OpenFOAM rejects them.
 
     `earlier` cures are repeated in cells that both meshes share.
     """
-    home, own, cures = raw.home, raw.own, None
+    near, home, own, cures = raw.near, raw.home, raw.own, None
     tell("short edges at walls")
     faces, changed = _collapsed(raw.faces, near.sizes[home])
     tell("checks of cells at walls")
@@ -332,7 +289,7 @@ def _finished(
     if not own.all():
         centroids = faces.measures.geometry.centroids
         faces = replace(faces, generators=np.where(own[:, None], faces.generators, centroids))
-    return _Made(faces, home, own, rejected, cures)
+    return replace(raw, faces=faces, home=home, own=own, rejected=rejected, cures=cures)
 
 
 def _collapsed(faces: Faces, sizes: np.ndarray, among: np.ndarray | None = None) -> tuple[Faces, np.ndarray]:
@@ -349,25 +306,6 @@ def _collapsed(faces: Faces, sizes: np.ndarray, among: np.ndarray | None = None)
     made = collapse_short(numbered, None, narrow_faces(numbered, sizes, examined), chosen)
     changed = changed_cells(numbered, made, with_neighbors(faces, examined, 2))
     return made.with_half_faces(faces.half_face[made.half_face]), changed
-
-
-def _simplify(walls: np.ndarray, near: NearWalls, rejected: np.ndarray) -> None:
-    """Change how the walls of `rejected` cells are made, or of their neighbors.
-
-    Parameters
-    ----------
-    walls : (p + 1,) int8
-        EXACT, FILLED or ROUNDED.
-    rejected : (k,) int
-    """
-    p = len(near.rows)
-    between = near.cells.neighbor < p
-    one, other = near.cells.owner[between], near.cells.neighbor[between]
-    one, other = np.concatenate([one, other]), np.concatenate([other, one])
-    mine = np.zeros(p + 1, bool)
-    mine[rejected] = True
-    mine[other[mine[one] & (walls[one] == ROUNDED)]] = True
-    walls[mine] = np.minimum(walls[mine] + 1, ROUNDED)
 
 
 def diagram_of(faces: Faces) -> Diagram:
@@ -417,7 +355,7 @@ class _Maker:
     """
 
     def __init__(self, surface: WallSurface, near: NearWalls, walls: np.ndarray) -> None:
-        self.surface = surface
+        self.surface, self.near, self.walls = surface, near, walls
         self.tree, self.sizes, self.generators = scipy.spatial.KDTree(near.generators), near.sizes, near.generators
         self.cells = near.cells
         self.owner, self.neighbor = self.cells.owner, self.cells.neighbor
@@ -746,4 +684,4 @@ class _Maker:
             half_face=np.concatenate([row[inner], np.full(len(walls), -1)]),
         ).compact()
         home = np.flatnonzero(seen)
-        return _Made(faces, home, np.ones(len(home), bool), np.zeros(0, np.int64))
+        return _Made(self.near, self.walls, faces, home, np.ones(len(home), bool), np.zeros(0, np.int64))
