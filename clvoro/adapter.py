@@ -478,7 +478,7 @@ class Adapter:
             continues a run.
         callback : callable, optional
             Called with each new row of the history (fields as in `Result.history`: ``row["mean_error"]``, ...). The
-            run stops if it returns True.
+            run stops if it returns True. Over ranks it is called where steps are taken: on rank 0 for each row.
         on_interrupt : "raise" or "return"
             What Ctrl-C does: raise `Interrupted`, which carries the result so far, or return that result.
 

@@ -102,19 +102,12 @@ class Checkpointer:
         for part in ("initial", "final"):
             if getattr(run, part) is not None:
                 arrays |= {f"{part}.{name}": array for name, array in vars(getattr(run, part)).items()}
-        state = {
-            "position": run.position,
-            "level": run.level,
+        state = progress_of(run) | {
             "levels": run.levels,
             "beginning": run.beginning,
-            "n_start": run.n_start,
-            "started": run.started,
-            "steps": run.steps,
-            "pace": run.pace,
             "next_label": mesh.next_label,
             "size_factor": float(mesh.size_factor).hex(),
             "elapsed": time.perf_counter() - run.began,
-            "methods": [_state_of(method) for method in _methods_of(run.schedule)],
         }
         about = {"fingerprint": self.fingerprint, "schedule": self.schedule, "state": state}
         pieces: list[tuple[str, int]] = []
@@ -129,7 +122,7 @@ class Checkpointer:
                 write_arrays(self.path, FORMAT, VERSION, arrays, compress=False)
 
         self.peers.agree(write_index)
-        if self.peers.count > 1:
+        if self.peers.size > 1:
             self._remove_others({name for name, _ in pieces})
 
     def _write_piece(self, rows: dict[str, np.ndarray]) -> list[tuple[str, int]]:
@@ -165,6 +158,8 @@ class Saved:
     ----------
     levels : int
         Number of coarser levels of the run.
+    parts : int
+        Number of parts that work on this level.
     beginning : Beginning
         What the run began with.
 
@@ -193,7 +188,9 @@ class Saved:
                 raise ValueError("counts")
             self.size_factor = float.fromhex(state["size_factor"])
             self.elapsed = float(state["elapsed"])
-            self._take_rows([(str(name), int(count)) for name, count in about.get("pieces", [])])
+            pieces = [(str(name), int(count)) for name, count in about.get("pieces", [])]
+            self.parts = peers.size if state["level"] == 0 else min(max(len(pieces), 1), peers.size)
+            self._take_rows(pieces)
             begins, why = state["beginning"]
             self.levels, self.beginning = int(state["levels"]), Beginning(begins, str(why))
             if begins not in get_args(Begins):
@@ -211,12 +208,12 @@ class Saved:
         """
         from ..io.arrays import read_arrays
 
-        part, parts = self.peers.number, self.peers.count
+        part, parts = self.peers.number, self.parts
         counts = [count for _, count in pieces] or [len(self.arrays["mesh.points"])]
         self.moves = parts != len(counts) and parts > 1
         ends = np.cumsum(counts)
-        begin, end = (ends[-1] * k // parts for k in (part, part + 1))
-        if parts == len(counts):
+        begin, end = (ends[-1] * k // parts if part < parts else 0 for k in (part, part + 1))
+        if parts == len(counts) and part < parts:
             begin, end = ends[part] - counts[part], ends[part]
         found = []
         for k, (last, count) in enumerate(zip(ends, counts, strict=True)):
@@ -344,14 +341,7 @@ class Saved:
     def resume(self, run: Run) -> float:
         """Give `run` the progress of the saved one; return the seconds that it had taken."""
         state = self.state
-        for method, values in zip(_methods_of(run.schedule), state["methods"], strict=True):
-            for name in _state_of(method):
-                setattr(method, name, values[name])
-        for name in ("level", "n_start", "started", "position", "steps", "pace"):
-            setattr(run, name, state[name])
-        steps = [action for action in run.schedule[: run.position] if isinstance(action, Step)]
-        run.last = steps[-1].method if steps else None
-        run.rows = [row.reshape(1) for row in self.arrays["history"]]
+        take_progress(run, state, self.arrays["history"])
         if self.peers.count == 1:
             run.initial, run.final = self._displacements("initial"), self._displacements("final")
         return self.elapsed
@@ -361,6 +351,24 @@ class Saved:
         if any(array is None for array in saved):
             return None
         return Displacements(*saved)  # type: ignore[arg-type]
+
+
+def progress_of(run: Run) -> dict[str, Any]:
+    """Return plain values that say how far `run` has come in its schedule."""
+    found = {name: getattr(run, name) for name in ("position", "level", "n_start", "started", "steps", "pace")}
+    return found | {"methods": [_state_of(method) for method in _methods_of(run.schedule)]}
+
+
+def take_progress(run: Run, found: dict[str, Any], history: np.ndarray) -> None:
+    """Let `run` have come as far as the one of `progress_of`, with this `history`."""
+    for method, values in zip(_methods_of(run.schedule), found["methods"], strict=True):
+        for name in _state_of(method):
+            setattr(method, name, values[name])
+    for name in ("level", "n_start", "started", "position", "steps", "pace"):
+        setattr(run, name, found[name])
+    steps = [action for action in run.schedule[: run.position] if isinstance(action, Step)]
+    run.last = steps[-1].method if steps else None
+    run.rows = [row.reshape(1) for row in history]
 
 
 def run_fingerprint(arguments: RunArguments, dtype: np.dtype) -> dict[str, Any]:

@@ -25,7 +25,7 @@ from ..sizing.field import as_field
 from ..solvers.linear_system import Solution
 from ..tessellation.periodic.images import FewCellsError
 from ..tessellation.readback.parts import CellRows
-from .checkpoint import Checkpointer, Saved, run_fingerprint
+from .checkpoint import Checkpointer, Saved, progress_of, run_fingerprint, take_progress
 from .diagnostics import MISSED, warn_of_errors, warn_of_moved_points, warn_of_obtuse_triangles, warn_of_other_sizes
 from .fixed_points import origins, put_back
 from .gathering import ResultParts
@@ -38,7 +38,8 @@ from .plan.efforts import EFFORTS
 from .plan.schedule import work_of
 from .preparation import Beginning, Plan, Prepared, judge_points, plan, prepare, start, without_far
 from .stages import Stages
-from .tuning import REACHED, RENEWAL, WINDOW
+from .state import MeshState
+from .tuning import PART_CELLS, REACHED, RENEWAL, WINDOW
 
 INTERRUPTED, STOPPED, UNDER_WAY = "interrupted", "stopped by the callback", "under way"
 MISSES = "plan ended, but the sizes are missed"
@@ -119,6 +120,7 @@ class Run:
         `beginning` is what a first try has found, or the checkpoint has.
         """
         stages, files, peers = self._stages, arguments.checkpoint, self._stages.engine.peers
+        peers.lead(peers.size)
         identity: dict[str, Any] = {}
         if saved is not None or files.path is not None or peers.count > 1:
             identity = run_fingerprint(arguments, stages.engine.real)
@@ -139,7 +141,13 @@ class Run:
         if self._on_memory is not None:
             self._on_memory(prepared.memory)
             self._on_memory = None
-        if saved is None:
+        self.arguments, self._setup = arguments, prepared.setup
+        self.target, self.levels = float(prepared.count.target), prepared.levels
+        parts = self._parts_on(prepared.levels if prepared.points is None else 0)
+        peers.lead(parts if saved is None else saved.parts)
+        if peers.rests:
+            beginning = beginning or Beginning("random")
+        elif saved is None:
             try:
                 self.state = start(prepared)
                 if beginning is None:
@@ -147,12 +155,13 @@ class Run:
                     if after is not prepared:
                         stages.release()
                         prepared = after
+                        self.target, self.levels = float(prepared.count.target), prepared.levels
                         self.state = start(prepared)
             except FewCellsError as error:
-                self._begin(arguments, self._fewer_levels(prepared.levels, error), beginning=beginning)
+                self._begin(arguments, self._fewer_levels(error), beginning=beginning)
                 return
         assert beginning is not None
-        self.arguments, self.beginning = arguments, beginning
+        self.beginning = beginning
         planned = plan(prepared, beginning.begins)
         self._writer = None
         if files.path is not None:
@@ -160,7 +169,7 @@ class Run:
             self._writer = peers.agree(lambda: Checkpointer(path, files.every, identity, planned.schedule, peers))
         self._renews = saved is not None or (self._writer is not None and files.every < math.inf)
         self.pace = RENEWAL if files.every else 0
-        if saved is not None:
+        if saved is not None and not peers.rests:
             self.state = saved.mesh(prepared.setup, planned.schedule)
         self._set_out(prepared, planned, saved)
         self._settings = self._describe(planned)
@@ -168,12 +177,12 @@ class Run:
     def _set_out(self, prepared: Prepared, planned: Plan, saved: Saved | None) -> None:
         """Set how far the run has come: it begins, or it goes on where it was saved."""
         multilevel = self._options.multilevel
-        self.schedule, self.target = planned.schedule, float(prepared.count.target)
-        self.levels = self.level = prepared.levels
+        self.schedule, self.level = planned.schedule, prepared.levels
         self._origins = prepared.origins
         self.n_cells = self._options.n_cells if multilevel else None
         self._tol = None if multilevel else self._options.tol
-        self.n_start, self.started = self.state.total, self.state.next_label
+        rests = self._stages.engine.peers.rests
+        self.n_start, self.started = (0, 0) if rests else (self.state.total, self.state.next_label)
         self.position = self.steps = self.obtuse = 0
         self.rows: list[np.ndarray] = []
         self.initial: Displacements | None = None
@@ -185,7 +194,7 @@ class Run:
         elapsed = 0.0 if saved is None else saved.resume(self)
         self.began, self.begun, self._renewed = time.perf_counter() - elapsed, self.steps, self.steps
         self.labeled = self.started + sum(int(row["inserted"][0]) for row in self.rows)
-        done = work_of(self.schedule, self.levels, self.state.engine.cell_dim, self.target)
+        done = work_of(self.schedule, self.levels, self._domain.cell_dim, self.target)
         self._progress = [*done[1:], 1.0]
         steps = [position for position, action in enumerate(self.schedule) if isinstance(action, Step)]
         self._last_step = steps[-1] if steps and self._tol is None else None
@@ -209,11 +218,45 @@ class Run:
         used |= {"path": self.beginning.why} if self.beginning.why else {}
         return {**used, "trade": planned.trade} if options.multilevel else used
 
-    def _fewer_levels(self, levels: int, error: FewCellsError) -> int:
+    def _fewer_levels(self, error: FewCellsError) -> int:
         """Return fewer levels after `error`: a periodic box has too few cells around it on the coarsest of them."""
-        if self._options.levels != "auto" or levels == 0:
+        if self._options.levels != "auto" or self.levels == 0:
             raise error
-        return levels - 1
+        peers = self._stages.engine.peers
+        peers.call(peers.size, self.levels - 1)
+        return self.levels - 1
+
+    def _parts_on(self, level: int) -> int:
+        """Return how many parts work on a level: all of them on the finest one, fewer where there are few cells."""
+        size = self._stages.engine.peers.size
+        cells = self.target / 2.0 ** (self._domain.cell_dim * level)
+        return size if level == 0 else min(max(int(cells / PART_CELLS), 1), size)
+
+    def call_parts(self, mesh: dict[str, Any]) -> None:
+        """Let as many parts work as the next finer level has work for; its mesh is made with the arguments `mesh`."""
+        peers = self._stages.engine.peers
+        count = self._parts_on(self.level - 1)
+        if count > peers.count:
+            state = {name: getattr(self, name) for name in ("begun", "_renewed", "labeled", "_stop", "stop_reason")}
+            peers.call(count, (mesh, progress_of(self), np.concatenate(self.rows), state))
+            vars(self._stages).pop("poisson", None)  # other kernels
+
+    def _join(self) -> bool:
+        """Wait for work, and join a run that others have refined; return whether it goes on."""
+        message = self._stages.engine.peers.rest()
+        if isinstance(message, int):
+            self._begin(self.arguments, message)
+            return True
+        mesh, progress, history, state = message
+        take_progress(self, progress, history)
+        vars(self).update(state)
+        engine = self._stages.engine
+        none = {"points": engine.empty((0, engine.dim)), "labels": engine.empty(0, np.int32)}
+        self.state, self.level = MeshState(self._setup, start=none, **mesh), self.level - 1
+        if not self.stop_reason:
+            self.position += 1
+            self._keep()
+        return not self.stop_reason
 
     @property
     def history(self) -> np.ndarray:
@@ -289,6 +332,8 @@ class Run:
         known = len(self.rows)
         self._mend()
         try:
+            if self._stages.engine.peers.rests:
+                return self._join()
             if not self.rows:
                 self.record(0.0)
                 if self._stop:
@@ -304,7 +349,7 @@ class Run:
                     self._keep()
         except FewCellsError as error:
             known = self.beginning if _replaces(self.arguments, self.beginning) else None
-            self._begin(self.arguments, self._fewer_levels(self.levels, error), beginning=known)
+            self._begin(self.arguments, self._fewer_levels(error), beginning=known)
             return self._advance()
         return len(self.rows) > known
 

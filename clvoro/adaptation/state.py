@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from operator import attrgetter
@@ -640,18 +641,19 @@ class MeshState:
         """Return the number of generators after `refine`."""
         return int(self.engine.peers.total(self.stages.refinement.count(self.t)))
 
-    def refine(self, finest: bool = False) -> MeshState:
+    def refine(self, finest: bool = False, begin: Callable[[dict[str, Any]], object] = lambda _: None) -> MeshState:
         """Return the mesh of the next finer level. The present generators keep their labels.
 
-        On the finest one fixed generators take the places of others.
+        On the finest one fixed generators take the places of others. `begin` is called before the mesh is made, with
+        those arguments of `MeshState` that are the same in all parts.
         """
         self.stages.metric.scale_sizes(0.5, self.h)
         rows = self.fixed if self.fixed > self.setup.first_row else 0
         finer = self.stages.refinement.refine(self.free, self.t, self.h, self.labels, rows)
         start, n, peers = {"points": finer}, len(finer), self.engine.peers
         del finer
-        begin = self.next_label - self.n + int(peers.before(n - self.n))
-        start["labels"] = self.engine.upload(np.arange(begin, begin + n, dtype=np.int32), np.int32)
+        first = self.next_label - self.n + int(peers.before(n - self.n))
+        start["labels"] = self.engine.upload(np.arange(first, first + n, dtype=np.int32), np.int32)
         cl.enqueue_copy(
             self.engine.queue, buffer_of(start["labels"]), buffer_of(self.labels), byte_count=self.labels.nbytes
         )
@@ -663,7 +665,9 @@ class MeshState:
         # Free the other arrays. After an interruption `update` computes them again.
         self._data = Arrays(self._data.generators)
         next_label = self.next_label + int(peers.total(n - self.n))
-        return MeshState(self.setup, self.size_factor / 2, start, self.tessellator, next_label, taken)
+        given = {"size_factor": self.size_factor / 2, "next_label": next_label, "taken": taken}
+        begin(given)
+        return MeshState(self.setup, start=start, coarser=self.tessellator, **given)
 
     def finalize(self) -> bool:
         """Free what only steps need, and evaluate the diagram in full precision, for `fetch_diagram`.

@@ -22,11 +22,13 @@ PATIENCE, NAPS = 2, (1e-4, 2e-3)
 """A rank that waits for a message first asks for it `PATIENCE` times without a pause. Then it sleeps before each
 question, since there may be more ranks than cores: for as long as it has already waited, within the limits `NAPS` in
 seconds. To fall asleep and to wake up takes some 30 microseconds of processor time."""
+REST = 0.02
+"""Seconds for which a rank without work sleeps before it asks again whether there is some."""
 FEW = 32
 """Largest number of ranks that send an array to each other directly. MPI's own algorithm has several rounds, and a rank
 that sleeps delays each of them."""
-ALARM, CLOSE, CLOSED = 1, 2, 3
-"""Tags of messages: a rank has failed, rank 0 sends the exit code, another rank has received it."""
+ALARM, CLOSE, CLOSED, CALL = 1, 2, 3, 4
+"""Tags of messages: a rank has failed, rank 0 sends the exit code, another rank has received it, rank 0 has work."""
 GRACE = 1.0
 """Seconds for which rank 0 waits for answers to the exit code, where each process has a core. The others wait 1.5 times
 as long for the code."""
@@ -46,12 +48,18 @@ class Swap(NamedTuple):
 class Peers:
     """The parts of a domain as one of them sees them. All of them call the same methods in the same order.
 
-    This class stands for a domain in one part. Subclasses connect several parts: they replace `exchange` and `gather`.
+    This class stands for a domain in one part. Subclasses connect several parts: they replace `exchange`, `gather`,
+    `call` and `rest`.
+
+    While a mesh has few cells, only the first parts work (`lead`). The others are alone, and rest until part 0 calls
+    them.
 
     Attributes
     ----------
-    number, count : int
-        Number of this part; number of parts.
+    number, count, size : int
+        Number of this part; number of parts that work together, 1 if this part rests; number of all parts.
+    rests : bool
+        Whether this part has no work.
     shared : bool
         Whether the run is one over ranks, be it a single one. The faces of a cell are then in the order of the
         permanent numbers of its neighbors.
@@ -62,7 +70,7 @@ class Peers:
         with `values` as a gather, too.
     """
 
-    number, count, shared, gathers = 0, 1, False, False
+    number, count, size, shared, gathers, rests = 0, 1, 1, False, False, False
     exchanges = reductions = waits = 0
 
     def exchange(self, sent: Sequence[np.ndarray], sizes: ArrayLike | None = None) -> list[np.ndarray]:
@@ -147,6 +155,20 @@ class Peers:
                 )
         return cast("Made", made)
 
+    def lead(self, count: int) -> None:
+        """Let only the first `count` parts work together from now on. All parts do this at the same time."""
+        self.rests = self.number >= count
+        self.count = 1 if self.rests else count
+
+    def call(self, count: int, message: object) -> None:
+        """Let the first `count` parts work together from now on. Those that work do this at the same time.
+
+        The others among them return from `rest` with `message` of part 0.
+        """
+
+    def rest(self) -> Any:
+        """Wait for a `call` of this part, and return what it tells."""
+
     def fail(self, error: BaseException) -> None:
         """Tell the others that this part has failed. Those that wait for a message raise a `RankError`."""
 
@@ -186,8 +208,8 @@ class Ranks(Peers):
                 "comm=MPI.COMM_WORLD after `from mpi4py import MPI`, with `pip install clvoro[mpi]`"
             )
         self._comm, self._alarms = comm.Dup(), comm.Dup()
-        self.number, self.count = comm.Get_rank(), comm.Get_size()
-        self._failed = ""
+        self.number, self.size = comm.Get_rank(), comm.Get_size()
+        self.count, self._failed = self.size, ""
 
     def exchange(self, sent: Sequence[np.ndarray], sizes: ArrayLike | None = None) -> list[np.ndarray]:
         """Send the numbers of rows, unless all ranks know theirs, and then the rows."""
@@ -197,7 +219,7 @@ class Ranks(Peers):
         told: list[Any] = []
         if sizes is not None:
             found[:] = sizes
-        elif self.count > FEW:
+        elif self.count == self.size > FEW:
             told = [self._comm.Ialltoall(counts, found)]
         else:
             told = [self._comm.Irecv(found[part : part + 1], part) for part in others]
@@ -241,7 +263,7 @@ class Ranks(Peers):
         values = np.asarray(values, order="C")
         found = np.empty((self.count, *values.shape), values.dtype)
         own, rows = _bytes(values), _bytes(found).reshape(self.count, values.nbytes)
-        if self.count > FEW:
+        if self.count == self.size > FEW:
             return found, [self._comm.Iallgather(own, rows)]
         found[self.number] = values
         others = [part for part in range(self.count) if part != self.number]
@@ -257,26 +279,46 @@ class Ranks(Peers):
         while requests and not requests[0].Testall(requests):
             turns += 1
             if turns > PATIENCE:
-                if self._alarms.Iprobe(tag=ALARM):
-                    self._failed = self._alarms.recv(tag=ALARM)
-                    raise RankError(self._failed)
+                self._hear_alarm()
                 time.sleep(min(max(waited, NAPS[0]), NAPS[1]))
                 waited = time.perf_counter() - began
+
+    def _hear_alarm(self) -> None:
+        """Raise an error if another rank has failed."""
+        if self._alarms.Iprobe(tag=ALARM):
+            self._failed = self._alarms.recv(tag=ALARM)
+            raise RankError(self._failed)
+
+    def call(self, count: int, message: object) -> None:
+        """Send them `message`, and the number of ranks that work."""
+        if self.number == 0:
+            more = range(self.count, count)
+            self._complete([self._alarms.isend((count, message), part, CALL) for part in more])
+        self.lead(count)
+
+    def rest(self) -> Any:
+        """Ask now and then whether rank 0 has sent something."""
+        while not self._alarms.Iprobe(0, CALL):
+            self._hear_alarm()
+            time.sleep(REST)
+        count, message = self._alarms.recv(source=0, tag=CALL)
+        self.lead(count)
+        return message
 
     def fail(self, error: BaseException) -> None:
         """Send the text of `error` to all other ranks."""
         if self._failed:
             return
-        self._failed = f"rank {self.number} of {self.count} has failed: {type(error).__name__}: {error}"
-        for part in range(self.count):
+        self._failed = f"rank {self.number} of {self.size} has failed: {type(error).__name__}: {error}"
+        for part in range(self.size):
             if part != self.number:
                 self._alarms.isend(self._failed, part, ALARM)
 
     def close(self, code: int) -> None:
         """Send `code` to the others, and wait for their answers."""
-        for part in range(1, self.count):
+        for part in range(1, self.size):
             self._alarms.isend(code, part, CLOSE)
-        for part in range(1, self.count):
+        for part in range(1, self.size):
             if self._hear(part, CLOSED, GRACE) is None:
                 self.abort(code)
 

@@ -23,16 +23,17 @@ _Calls: TypeAlias = "queue.SimpleQueue[Callable[[], object] | None]"
 class _Table:
     """Hands over objects among threads, in rounds. In each round a thread gives one object, and waits for all others.
 
-    Objects of one round are kept during the next one, since other threads may still read them.
+    Each round has a list of its own, since threads of earlier rounds may still read theirs.
     """
 
     def __init__(self, count: int) -> None:
-        self._places, self._changed = ([None] * count, [None] * count), threading.Condition()
+        self._places, self._changed = [None] * count, threading.Condition()
         self._there = self._rounds = 0
         self._closed = ""
+        self._calls: dict[int, Any] = {}
 
-    def hand_over(self, number: int, given: Any) -> list[Any]:
-        """Give an object as thread `number`, and return the objects of all threads in their order.
+    def hand_over(self, number: int, given: Any, count: int) -> list[Any]:
+        """Give an object as thread `number`, and return the objects of the first `count` threads in their order.
 
         Raises
         ------
@@ -41,17 +42,31 @@ class _Table:
         """
         with self._changed:
             turn = self._rounds
-            places: list[Any] = self._places[turn % 2]
+            places: list[Any] = self._places
             if not self._closed:
                 places[number] = given
                 self._there += 1
-                if self._there == len(places):
-                    self._there, self._rounds = 0, turn + 1
+                if self._there == count:
+                    self._there, self._rounds, self._places = 0, turn + 1, [None] * len(places)
                     self._changed.notify_all()
                 self._changed.wait_for(lambda: self._rounds > turn or self._closed)
             if self._rounds == turn:
                 raise RankError(self._closed)
-        return list(places)
+        return list(places[:count])
+
+    def call(self, number: int, message: Any) -> None:
+        """Let thread `number`, which has no work, return from `rest` with `message`."""
+        with self._changed:
+            self._calls[number] = message
+            self._changed.notify_all()
+
+    def rest(self, number: int) -> Any:
+        """Wait until thread `number` is called, and return its message. Raises RankError as `hand_over`."""
+        with self._changed:
+            self._changed.wait_for(lambda: number in self._calls or self._closed)
+            if number not in self._calls:
+                raise RankError(self._closed)
+            return self._calls.pop(number)
 
     def close(self, why: str) -> None:
         """Let threads that wait, and all that come later, raise an error. The first reason counts."""
@@ -66,27 +81,29 @@ class Threads(Peers):
     shared = True
 
     def __init__(self, team: Team, number: int, count: int) -> None:
-        self.team, self.number, self.count = team, number, count
+        self.team, self.number, self.size = team, number, count
+        self.lead(count)
 
     def begin(self, table: _Table, calls: _Calls) -> None:
         """Begin to work with the others at `table`. The thread that waits for all of them takes the `calls`."""
         self._table, self._calls = table, calls
+        self.lead(self.size)
 
     def end(self) -> None:
         """Let threads that still wait for this one raise an error."""
-        self._table.close(f"part {self.number} of {self.count} has ended, and others wait for it")
+        self._table.close(f"part {self.number} of {self.size} has ended, and others wait for it")
 
     def gather(self, values: np.ndarray) -> list[np.ndarray]:
         """Hand over a copy, so that this part may write to `values` again. The arrays are read-only."""
         self.reductions += 1
         own = np.array(values)
         own.setflags(write=False)
-        return self._table.hand_over(self.number, own)
+        return self._table.hand_over(self.number, own, self.count)
 
     def exchange(self, sent: Sequence[np.ndarray], sizes: ArrayLike | None = None) -> list[np.ndarray]:
         """Hand over copies of the arrays."""
         self.exchanges += 1
-        given = self._table.hand_over(self.number, [np.array(values) for values in sent])
+        given = self._table.hand_over(self.number, [np.array(values) for values in sent], self.count)
         return [arrays[self.number] for arrays in given]
 
     def swap(self, rows: Swap, values: np.ndarray | None = None) -> list[np.ndarray]:
@@ -95,13 +112,26 @@ class Threads(Peers):
         self.reductions += values is not None
         sent = np.split(np.array(rows.sent), np.cumsum(rows.sent_sizes)[:-1])
         given = sent, None if values is None else np.array(values)
-        arrays, found = zip(*self._table.hand_over(self.number, given), strict=True)
+        arrays, found = zip(*self._table.hand_over(self.number, given, self.count), strict=True)
         np.concatenate([pieces[self.number] for pieces in arrays], out=rows.received)
         return [] if values is None else list(found)
 
     def fail(self, error: BaseException) -> None:
         """Let all calls of other threads, and further ones of this thread, raise an error."""
-        self._table.close(f"part {self.number} of {self.count} has failed: {type(error).__name__}: {error}")
+        self._table.close(f"part {self.number} of {self.size} has failed: {type(error).__name__}: {error}")
+
+    def call(self, count: int, message: object) -> None:
+        """Tell the threads themselves."""
+        if self.number == 0:
+            for number in range(self.count, count):
+                self._table.call(number, (count, message))
+        self.lead(count)
+
+    def rest(self) -> Any:
+        """Wait for thread 0."""
+        count, message = self._table.rest(self.number)
+        self.lead(count)
+        return message
 
     def ask(self, call: Callable[[], object]) -> Any:
         """Return the result of `call` in the thread that waits for the team, or raise its error; None after Ctrl-C."""

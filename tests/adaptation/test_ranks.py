@@ -17,7 +17,8 @@ import numpy as np
 import pytest
 
 import clvoro
-from clvoro.adaptation import estimates
+from clvoro.adaptation import estimates, run
+from clvoro.adaptation.plan import schedule
 from clvoro.cli.cases import load_case
 from clvoro.cli.jobs import Job
 from clvoro.cli.ranks import this_rank
@@ -198,19 +199,26 @@ def test_a_run_in_parts_of_a_periodic_box(ctx, tmp_path):
 
 
 @pytest.mark.parametrize("kind", ["plane", "space", "sphere"])
-def test_a_run_in_parts(ctx, kind, tmp_path):
+def test_a_run_in_parts(ctx, kind, tmp_path, monkeypatch):
     """Each part has its own cells, in balance; the whole has the sizes and shapes of a run without parts.
+
+    On the coarsest of three levels one part works, on the next one two.
 
     ParaView's library reads the pieces of all parts as one mesh.
     """
     dim = 2 if kind == "plane" else 3
     domain = clvoro.Sphere(0.5) if kind == "sphere" else clvoro.Box((0,) * dim, (1,) * dim)
     given = domain, ramp({"plane": 0.05, "space": 0.1, "sphere": 0.1}[kind])
-    alone = clvoro.Adapter(ctx).run(*given, effort="fast")
-    meshes, whole = run_in(3, ctx, *given, effort="fast", path=tmp_path)
+    few = clvoro.MultilevelOptions(levels=1 if kind == "sphere" else 2)
+    alone = clvoro.Adapter(ctx).run(*given, effort="fast", options=few)
+    monkeypatch.setattr(run, "PART_CELLS", len(alone) / 2**domain.cell_dim / 2.5)
+    meshes, whole = run_in(3, ctx, *given, effort="fast", options=few, path=tmp_path)
     assert whole.check()
+    assert whole.history["level"][0] == few.levels
+    for name in set(whole.history.dtype.names) - {"seconds"}:
+        assert all(np.array_equal(mesh.history[name], whole.history[name]) for mesh in meshes), name
     if dim == 3:
-        again = clvoro.Adapter(devices=[ctx] * 3, share_gpus=True).run(*given, effort="fast")
+        again = clvoro.Adapter(devices=[ctx] * 3, share_gpus=True).run(*given, effort="fast", options=few)
         assert again.parts is None
         for name in ARRAYS:
             assert np.array_equal(getattr(again, name), getattr(whole, name)), name
@@ -338,6 +346,23 @@ def test_checkpoints_are_resumed_on_any_number_of_parts(ctx, tmp_path, monkeypat
     next(file for file in tmp_path.iterdir() if file.name.endswith(".1")).unlink()
     with pytest.raises((InputError, RankError), match="No such file"):
         run_in(2, ctx, *given, **short, checkpoint=clvoro.Checkpoint(None, resume=state))
+
+
+def test_parts_join_a_run(ctx, tmp_path, monkeypatch):
+    """From a checkpoint of a level on which one part works, and where that level turns out to be too coarse."""
+    monkeypatch.setitem(schedule.COARSEST, 2, 60)
+    given = clvoro.Box((0, 0), (4, 0.7), periodic=(False, True)), 0.06
+    state, short = tmp_path / "state", {"effort": "fast", "max_steps": 9}
+    whole = run_in(2, ctx, *given, **short, checkpoint=clvoro.Checkpoint(state, 0))[1]
+    assert whole.settings["levels"] == whole.history["level"][0] == 1 < schedule.auto_levels(len(whole), 2)
+    options = {**short, "checkpoint": clvoro.Checkpoint(state, 0)}
+    assert run_in(2, ctx, *given, **options, callback=lambda row: row["step"] == 2)[1].history["step"][-1] == 2
+    assert [file.name for file in tmp_path.iterdir()] == ["state"]
+    for parts in (2, 3):
+        again = run_in(parts, ctx, *given, **short, checkpoint=clvoro.Checkpoint(None, resume=state))[1]
+        assert again.check()
+        assert again.history["step"][-1] == 9
+        assert parts == 3 or np.array_equal(again.points, whole.points)
 
 
 def test_devices_share_a_run(ctx):

@@ -141,7 +141,7 @@ class Refine:
         # The finer level needs another solver and more memory.
         run.state.stages.clear_poisson()
         run.state.engine.workspace.shrink()
-        finer = run.state.refine(finest=run.level == 1)
+        finer = run.state.refine(finest=run.level == 1, begin=run.call_parts)
         # One assignment, because an interruption between two would leave a mesh that does not belong to its level.
         run.state, run.level = finer, run.level - 1
 
