@@ -83,13 +83,13 @@ class FaceSharing:
         self.half_faces: HalfFaces = list_half_faces(engine, box, t)
         f = self.half_faces
         self.c, self.h = len(f.owners), len(f.labels)
+        self.merged = False
+        self.labels = f.same.copy()
+        self.name_vertices(f.same.copy())
         self.twins, self.counts = (engine.empty(self.h, np.int32) for _ in range(2))
         engine.run_each(self._kernels.find_twins, t.n, t.starts, f.starts, f.labels, self.twins)
         self.differs = engine.empty(self.h, np.uint8)
         self.reduced = engine.empty(len(f.loops), np.int32)
-        self.merged = False
-        self.labels = f.same.copy()
-        self.name_vertices(f.same.copy())
 
     def run(self) -> SharedFaces:
         """Return the faces once their half-faces are identical."""
@@ -158,18 +158,21 @@ class FaceSharing:
         if not int(any_[0].get()):
             return False
         self.merged = True
+        del distances, targets, rejected
         self.name_vertices(labels)
         return True
 
     def _write(self, doublings: int) -> SharedFaces:
         engine, t, f, k, c = self.engine, self.t, self.half_faces, self._kernels, self.c
         n, m, scan = t.n, int(t.starts[t.n].get()), Scan(engine)
+        del f.same, f.twin_corners, f.sharpness, f.loops, self.twins, self.differs  # memory for the result
         starts, ids = engine.empty(m + 1, np.int32), engine.zeros(c + 1, np.int32)
         engine.run_each(k.measure_loops, n, t.starts, f.starts, f.loop_starts, self.reduced, self.counts, starts, ids)
         scan.exclusive(starts, starts, m)
         scan.exclusive(ids, ids, c)
         vertices = engine.empty(int(starts[m].get()), np.int32)
-        positions = engine.empty((int(ids[c].get()), 3))
         engine.run_each(k.write_loops, n, t.starts, f.starts, f.loop_starts, self.reduced, ids, starts, vertices)
+        del self.reduced, self.counts
+        positions = engine.empty((int(ids[c].get()), 3))
         engine.run_each(k.write_positions, c, *self._vertices, ids, positions)
         return SharedFaces(positions, starts, vertices, self.merged, doublings > SAFE_DOUBLINGS)

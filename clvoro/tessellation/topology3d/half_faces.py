@@ -18,7 +18,7 @@ from ..device_diagram import Tessellation
 MOST_LOOP_ENTRIES = 2**31 - 1
 
 
-@dataclass(frozen=True)
+@dataclass
 class HalfFaces:
     """Corners of all cells, and loops of corners around their faces, on the device."""
 
