@@ -1,8 +1,8 @@
 """Flow around a cylinder with OpenFOAM on meshes of clvoro, Gmsh and blockMesh, against reference values.
 
     python bench/cylinder.py [--reynolds 20|100] [--cells 3000,6000,13000] [--meshers NAMES] [--samples 3]
-                             [--convection linear|linearUpwind] [--cycles 3] [--again 0] [--pictures FOLDER]
-                             [--device NAME] [--json]
+                             [--convection linear|linearUpwind] [--cycles 3] [--pictures FOLDER] [--device NAME]
+                             [--json]
 
 The benchmark of Schaefer and Turek (1996): a channel of 2.2 x 0.41, a cylinder of diameter 0.1 at (0.2, 0.2), a
 parabolic inlet. At Re 20 the flow is steady (`simpleFoam`), at Re 100 it sheds vortices (`pimpleFoam`). All meshes
@@ -20,13 +20,12 @@ channel below the axis of the cylinder, with the mirror images of its generators
 "Followed" begins as that mesh, with as many cells as the row says, and follows the solution: `clvoro.foam.adapt_case`
 makes a new mesh --cycles times from U. No place is named. With "forces" the goal are the forces on the cylinder, by the
 distance from it (`FieldSizes(forces="cylinder")`); with "adjoints" drag and lift, by their adjoint velocities, which
-`adjointOptimisationFoam` solves for; with "fluxes" cells count by the flux of momentum, too. At Re 100 the flow is
-solved on 2,000 cells first, and followed in ten periods of shedding.
+`adjointOptimisationFoam` solves for. At Re 100 the flow is solved on 2,000 cells first, and followed in ten periods of
+shedding.
 
 With --samples several meshes are made for each row, with counts that differ by one percent and with other seeds:
-shown are the median, the range, and of five or more the standard error of the median. With --again the last sizes of
-each loop at Re 20 are meshed as many times more, with other seeds: the row then is of all these meshes. Without
-OpenFOAM the script ends with a message. Without Gmsh (pip install gmsh) its rows are left out.
+shown are the median, the range, and of five or more the standard error of the median. Without OpenFOAM the script
+ends with a message. Without Gmsh (pip install gmsh) its rows are left out.
 """
 
 from __future__ import annotations
@@ -35,7 +34,7 @@ import math
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -149,46 +148,27 @@ def mesh_newcomer(uniform: bool) -> Callable[..., None]:
         if not uniform:
             ring = clvoro.sizing.ClosedPolyline(domain.vertices[4:])
             field = clvoro.sizing.Distance(ring, h_min=0.002, slope=0.06, h_max=0.02)
-        write_newcomer(case, adapter, field, n_cells, seed)
+        made = adapter.run(domain, field, n_cells=n_cells, seed=seed)
+        folder = case.folder / "constant" / "polyMesh"
+        made.to_openfoam(folder, types={"inlet": "patch", "outlet": "patch"}, thickness=THICKNESS)
+        made.save(folder / "clvoro.npz")
 
     return mesh
-
-
-def write_newcomer(case: Case, adapter: clvoro.Adapter, field: object, n_cells: int, seed: int) -> None:
-    """Mesh the newcomer's channel with the sizes `field`."""
-    made = adapter.run(_newcomer(), field, n_cells=n_cells, seed=seed)
-    folder = case.folder / "constant" / "polyMesh"
-    made.to_openfoam(folder, types={"inlet": "patch", "outlet": "patch"}, thickness=THICKNESS)
-    made.save(folder / "clvoro.npz")
 
 
 FOLLOWED: dict[str, tuple[clvoro.foam.FieldSizes, str]] = {
     "followed": (clvoro.foam.FieldSizes(), "simpleFoam"),
     "followed, forces": (clvoro.foam.FieldSizes(forces="cylinder"), "simpleFoam"),
     "followed, adjoints": (clvoro.foam.FieldSizes(adjoints=("Uadrag", "Ualift")), "adjointOptimisationFoam"),
-    "followed, fluxes": (
-        clvoro.foam.FieldSizes(adjoints=("Uadrag", "Ualift"), viscosity=VISCOSITY),
-        "adjointOptimisationFoam",
-    ),
 }
 """Sizes and solvers of meshes that follow the solution at Re 20; at Re 100 all have those for forces."""
 
 
-def follow(
-    case: Case, adapter: clvoro.Adapter, n_cells: int, cycles: int, mesher: str, used: list[clvoro.sizing.Estimate]
-) -> dict[str, float]:
-    """Adapt the case to its solution; return drag and lift on the last mesh, the cells, and seconds by kind.
-
-    The sizes of all cycles are added to `used`.
-    """
-    estimator, solver = FOLLOWED[mesher]
-    if estimator.adjoints:
+def follow(case: Case, adapter: clvoro.Adapter, n_cells: int, cycles: int, mesher: str) -> dict[str, float]:
+    """Adapt the case to its solution; return drag and lift on the last mesh, the cells, and seconds by kind."""
+    sizes, solver = FOLLOWED[mesher]
+    if sizes.adjoints:
         write_adjoints(case)
-
-    def sizes(found: Mapping[str, np.ndarray], on: clvoro.Diagram, n_cells: int) -> clvoro.sizing.Estimate:
-        used.append(estimator(found, on, n_cells))
-        return used[-1]
-
     rows = clvoro.foam.adapt_case(
         case.folder, n_cells=n_cells, cycles=cycles, solver=solver, interval=3000, sizes=sizes, adapter=adapter
     )
@@ -508,17 +488,6 @@ def value_at(point: tuple[float, float], centroids: np.ndarray, values: np.ndarr
     return float(np.linalg.lstsq(terms * weight[:, None], values[near] * weight, rcond=None)[0][0])
 
 
-def flow_again(
-    folder: Path, adapter: clvoro.Adapter, size: clvoro.sizing.Estimate, n_cells: int, seed: int, convection: str
-) -> dict[str, float]:
-    """Return the figures of the flow at Re 20 on another mesh of the newcomer's channel with the same sizes."""
-    case = Case(folder)
-    write_newcomer(case, adapter, size, n_cells, seed)
-    mesh = Mesh.of(folder)
-    flow = steady_flow(case, mesh, convection)
-    return {**flow, **errors(flow), "cells": len(mesh)}
-
-
 def steady_flow(case: Case, mesh: Mesh, convection: str) -> dict[str, float]:
     """Solve at Re 20; return drag, lift, pressure difference and the number of iterations."""
     write_case(case, mesh, 20, convection)
@@ -684,7 +653,6 @@ def main() -> None:
     options_of.add_argument("--samples", type=int, default=1)
     options_of.add_argument("--convection", choices=("linear", "linearUpwind"), default="linearUpwind")
     options_of.add_argument("--cycles", type=int, default=3)
-    options_of.add_argument("--again", type=int, default=0, metavar="N", help="more meshes of the last sizes")
     options_of.add_argument("--pictures", type=Path, metavar="FOLDER")
     options = options_of.parse_args()
     re_ = options.reynolds
@@ -705,7 +673,6 @@ def main() -> None:
             record: dict[str, Any] = {"mesher": mesher, "reynolds": re_, "convection": convection}
             kept: dict[str, list[float]] = {}
             for sample in range(1 if mesher == "blockMesh" else options.samples):
-                used: list[clvoro.sizing.Estimate] = []
                 with tempfile.TemporaryDirectory() as folder:
                     case = Case(Path(folder))
                     try:
@@ -723,26 +690,21 @@ def main() -> None:
                         flow = shedding.flow(case, mesh, convection)
                     elif mesher in FOLLOWED:
                         write_case(case, mesh, 20, convection)
-                        flow = follow(case, adapter, n, options.cycles, mesher, used)
+                        flow = follow(case, adapter, n, options.cycles, mesher)
                         mesh = case.latest_mesh()
                         flow |= pressure_difference(case, mesh)
                     else:
                         flow = steady_flow(case, mesh, convection)
                     found = {**flow, **(errors(flow) if re_ == 20 else {}), "cells": len(mesh)}
                     found["seconds"] = time.perf_counter() - start
-                    rows = [found]
-                    for k in range(options.again if used else 0):
-                        where = Path(folder) / f"again-{k}"
-                        where.mkdir()
-                        rows.append(flow_again(where, adapter, used[-1], n, 1000 * sample + k + 1, convection))
-                    for key, value in ((key, value) for row in rows for key, value in row.items()):
+                    for key, value in found.items():
                         kept.setdefault(key, []).append(value)
                     if options.pictures and not sample:
                         options.pictures.mkdir(parents=True, exist_ok=True)
                         name = f"{mesher.replace(', ', '_').replace(' ', '_')}_{re_}_{n}.png"
                         picture(case, mesh, options.pictures / name, mesher)
             if kept:
-                report.add({**record, **kept}, f"{mesher}, {len(kept['drag'])} of {n}")
+                report.add({**record, **kept}, f"{mesher}, {n}")
     ranges = ", ".join(f"{name} {low} to {high}" for name, (low, high) in RANGES.items())
     title = f"Flow around a cylinder at Re {re_}, {convection}"
     report.finish(heading(adapter, title if re_ == 20 else f"{title}; reference: {ranges}"))

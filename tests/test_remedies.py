@@ -1002,6 +1002,7 @@ TESTED_IN = {
     "has one value in all cells of the latest time": "foam/test_foam_cases.py::test_bad_input_changes_nothing",
     "a mesh that the solver moves or refines": "foam/test_foam_cases.py::test_bad_input_changes_nothing",
     "which writes one for each patch": "foam/test_foam_cases.py::test_bad_input_changes_nothing",
+    "has no number nu": "foam/test_foam_cases.py::test_bad_input_changes_nothing",
     "expected both; name adjoints=": "foam/test_foam_cases.py::test_wrong_fields_are_refused",
     "has none of the new cells": "foam/test_foam_cases.py::test_zones_and_groups_follow",
     "U enters the domain with": "foam/test_foam_cases.py::test_bad_input_changes_nothing",

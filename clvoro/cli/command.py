@@ -275,9 +275,6 @@ def _add_foam(commands: Any) -> None:
     goal.add_argument(
         "--adjoints", metavar="LIST", type=_names, default=(), help="adjoint velocities of goals, among the fields"
     )
-    adapt.add_argument(
-        "--viscosity", metavar="NU", type=float, help="with --adjoints: the kinematic viscosity, for momentum fluxes"
-    )
     adapt.add_argument("--cycles", metavar="N", type=int, default=1, help="number of meshes (default: 1)")
     adapt.add_argument("--solver", metavar="PROGRAM", help="program that solves the case, such as simpleFoam")
     adapt.add_argument(
@@ -586,7 +583,6 @@ def _foam_adapt(arguments: argparse.Namespace) -> int:
             arguments.h_min,
             arguments.h_max,
             arguments.growth,
-            arguments.viscosity,
         ),
         layers=arguments.layers,
         mesh=arguments.mesh,

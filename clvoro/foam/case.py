@@ -222,6 +222,25 @@ class FoamCase:
         except ValueError:
             return None
 
+    def viscosity(self) -> float:
+        """Return the kinematic viscosity, `nu` of ``constant/transportProperties``.
+
+        Raises
+        ------
+        InputError
+            If it is not there.
+        """
+        path = self.folder / "constant" / "transportProperties"
+        text = path.read_text() if path.exists() else ""
+        place = _entry(text, "nu")
+        try:
+            return float(text[place].split()[-1] if place else "")
+        except ValueError as error:
+            raise InputError(
+                f"{path} has no number nu, expected the kinematic viscosity, by which cells count for adjoints; write "
+                "it there, or pass viscosity="
+            ) from error
+
     def set_control(self, **entries: object) -> None:
         """Change entries of ``system/controlDict``; the first time a copy is kept beside the reports."""
         text = self.control.read_text()

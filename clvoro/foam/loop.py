@@ -88,11 +88,12 @@ class FieldSizes:
         Patches whose forces are the goal: cells near them count more (`force_weight`).
     adjoints : sequence of str
         Adjoint velocities among the case's fields, such as "Ua" of ``adjointOptimisationFoam``, one for each goal:
-        cells count by the largest gradient of these (`steepness`). They are compared as they are: equal errors of the
-        goals count alike, such as .001 of two coefficients. A larger weight of its objective makes a goal count more.
+        cells count by the largest gradient of these (`steepness`), times what an error e of the velocity, the first of
+        `fields`, changes in the flux of momentum, ``(speed + viscosity / h) e``. They are compared as they are: equal
+        errors of the goals count alike, such as .001 of two coefficients. A larger weight of its objective makes a goal
+        count more.
     viscosity : float, optional
-        Kinematic viscosity, with `adjoints`. An error e of the velocity, the first of `fields`, changes the flux of
-        momentum through a face by ``(speed + viscosity / h) e``: cells count by this, too.
+        Kinematic viscosity, with `adjoints`; by default `adapt_case` takes that of the case.
     p : float, optional
         As for `hessian_size`. By default 2, and 1 for a goal.
     h_min, h_max, growth : float
@@ -137,9 +138,8 @@ class FieldSizes:
             weight = force_weight(self.forces, on)
         elif self.adjoints:
             weight = np.maximum.reduce([steepness(found[name], on) for name in self.adjoints])
-            if self.viscosity is not None:
-                speed = np.linalg.norm(np.atleast_2d(found[self.fields[0]].T), axis=0)
-                weight = weight * (speed + self.viscosity * on.volumes ** (-1 / on.domain.cell_dim))
+            speed = np.linalg.norm(np.atleast_2d(found[self.fields[0]].T), axis=0)
+            weight = weight * (speed + (self.viscosity or 0.0) * on.volumes ** (-1 / on.domain.cell_dim))
         p = self.p or (2.0 if weight is None else 1.0)
         bounds: dict[str, Any] = {"p": p, "h_min": self.h_min, "h_max": self.h_max, "growth": self.growth}
         return hessian_size([found[f] for f in self.fields], on=on, n_cells=n_cells, weight=weight, **bounds)
@@ -163,11 +163,11 @@ def adapt_case(
 ) -> list[FoamCycle]:
     """Adapt the mesh of a case of OpenFOAM to its latest solution, `cycles` times.
 
-    A cycle reads the latest time, estimates sizes from its fields, adapts the present generators to them, or makes new
-    ones if the sizes differ much, and transfers all fields in cells. The new mesh and its fields become the latest
-    time, in place of the old one, in one step: at any moment the case has a mesh that fits its fields. Fluxes `phi` are
-    projected so that they are free of divergence. Names and types of patches and boundary conditions stay; their lists
-    of values are interpolated.
+    A cycle reads the latest time, estimates sizes from its fields, makes a mesh with them, and transfers all fields in
+    cells. With `window` it adapts the present generators, or makes new ones where the sizes differ much. The new mesh
+    and its fields become the latest time, in place of the old one, in one step: at any moment the case has a mesh that
+    fits its fields. Fluxes `phi` are projected so that they are free of divergence. Names and types of patches and
+    boundary conditions stay; their lists of values are interpolated.
 
     With `solver` the case is solved first, between the cycles, and at the end. A call that was killed goes on where it
     was, if it is repeated.
@@ -237,10 +237,13 @@ def adapt_case(
     check_integer("cycles", cycles, 1)
     if solver is None and cycles > 1:
         raise InputError(f"cycles is {cycles} without a solver, expected 1; give solver=, such as 'simpleFoam'")
+    known, sizes = FoamCase(case), sizes or FieldSizes()
+    if isinstance(sizes, FieldSizes) and sizes.adjoints and sizes.viscosity is None:
+        sizes = replace(sizes, viscosity=known.viscosity())
     loop = _Loop(
-        FoamCase(case),
+        known,
         n_cells,
-        sizes or FieldSizes(),
+        sizes,
         check_number("window", window, least=0),
         None if layers is None else (layers,) if isinstance(layers, Layers) else tuple(layers),
         effort,
@@ -407,7 +410,9 @@ class _Loop:
         size = self._sizes_in_window(fields, old, latest)
         layers = tuple(_layers_of(note["layers"])) if self.layers is None else self.layers
         domain = old.diagram.domain
-        points = old.diagram.points
+        # Moved generators keep their number along walls, which a steady flow notices; fields of an unsteady one lose
+        # less between meshes that are alike.
+        points = old.diagram.points if self.window else None
         made = self.adapter.run(domain, size, self.effort, points=points, n_cells=self.n_cells, layers=layers)
         mesh_seconds = time.perf_counter() - start
         zones = old.zones_on(made.diagram)

@@ -238,8 +238,8 @@ def polygon_of_edges(points: np.ndarray, ends: np.ndarray, names: list[str]) -> 
     if open_ends:
         x, y = points[open_ends[0]]
         raise InputError(
-            f"the boundary is not closed, or touches itself, at ({x:g}, {y:g}), expected rings; a baffle without "
-            "thickness cannot be adapted"
+            f"the boundary is not closed, or touches itself, at ({x:g}, {y:g}), expected rings without baffles; "
+            "if clvoro made the mesh pass it as mesh="
         )
     left, rings = set(range(len(ends))), []
     while left:

@@ -385,6 +385,10 @@ def empty_body(case):
     spoil(case, "constant/polyMesh/boundary", b"symmetry", b"empty")
 
 
+def add_viscosity(case):
+    (case / "constant" / "transportProperties").write_text("nu nu [0 2 -1 0 0 0 0] 1e-05;")
+
+
 def nan_in_row_3(values):
     return np.where(np.arange(len(values))[:, None] == 3, np.nan, values)
 
@@ -408,7 +412,8 @@ def nan_in_row_3(values):
         (lambda c: None, {"sizes": foam.FieldSizes(["T"])}, InputError, "no field T"),
         (lambda c: None, {"sizes": foam.FieldSizes(["k"])}, InputError, "k has one value .*run the solver"),
         (lambda c: None, {"sizes": foam.FieldSizes(forces="wing")}, InputError, "some of walls, outlet, inlet, body"),
-        (lambda c: None, {"sizes": foam.FieldSizes(adjoints=["Ua"])}, InputError, "no field Ua"),
+        (lambda c: None, {"sizes": foam.FieldSizes(adjoints=["Ua"])}, InputError, "no number nu, .*write it"),
+        (add_viscosity, {"sizes": foam.FieldSizes(adjoints=["Ua"])}, InputError, "no field Ua"),
         (lambda c: None, {"cycles": 3}, InputError, "without a solver"),
         (lambda c: None, {"n_cells": 0}, InputError, "n_cells"),
         (lambda c: None, {"n_cells": 3}, InputError, "at least 16: 4 for each of the 4 patches"),
