@@ -99,7 +99,7 @@ def on_surfaces(
     def change(points: np.ndarray, rows: np.ndarray, move: int) -> np.ndarray:
         return moved(domain, depth, sizes, points, rows, move, held) if len(rows) <= FEW * len(points) else points
 
-    return fewest_rejected(first, points, sizes, lambda a: a.home[a.rejected], change, again, MOVES).diagram
+    return fewest_rejected(first, points, sizes, lambda a: a.home[a.rejected], change, again, [False] * MOVES).diagram
 
 
 def _made(diagram: Diagram, sheets: Sheets) -> _OnSurfaces:

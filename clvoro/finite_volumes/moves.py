@@ -40,7 +40,7 @@ def fewest_rejected(
     rejected: Callable[[T], np.ndarray],
     change: Callable[[np.ndarray, np.ndarray, int], np.ndarray],
     remake: Callable[[np.ndarray, T], T | None],
-    trials: int,
+    goes_on: list[bool],
 ) -> T:
     """Change what a mesh is made of at rejected cells; return the mesh of the fewest rejected cells.
 
@@ -60,20 +60,21 @@ def fewest_rejected(
         changed, and those beside them; or the same one, for which no mesh is made.
     remake : callable
         Called with another state and the last mesh. Returns the mesh of that state, or None if there is none.
-    trials : int
-        Largest number of trials.
+    goes_on : list of bool
+        For each trial whether it changes the state of the one before at the cells that were rejected then. Others
+        change the best state so far.
     """
     best, last, bad, points = first, first, rejected(first), state[:, :3]
-    for number in range(trials):
-        rows = distinct(bad[bad >= 0])
-        if not len(rows):
+    tried, new = state, bad
+    for number, further in enumerate(goes_on):
+        base, rows = (tried, new) if further else (state, bad)
+        rows = distinct(rows[rows >= 0])
+        if not (bad >= 0).any():
             break
-        trial = change(state, rows, number)
-        if (trial == state).all():
+        trial = change(base, rows, number) if len(rows) else base
+        if (trial == base).all() or (made := remake(trial, last)) is None:
             continue
-        if (made := remake(trial, last)) is None:
-            continue
-        last, new = made, rejected(made)
+        last, tried, new = made, trial, rejected(made)
         if len(new) < len(rejected(best)):
             best = made
         bad, new = bad[bad >= 0], new[new >= 0]

@@ -49,29 +49,31 @@ def test_pairs_stay_mirror_images_in_all_patches_between_them():
 
 
 def test_the_mesh_of_the_fewest_rejected_cells_is_kept():
-    """What changed in a group stays if that has fewer rejected cells; all else is changed back."""
+    """What changed in a group stays if it has fewer rejected cells. Trials go on from there, or from the one before."""
     state = np.column_stack([np.arange(300) * 3.0, np.zeros((300, 3))])
-    begun, made = [], []
+    begun = []
 
     def change(now, rows, number):
         begun.append((np.flatnonzero(now[:, 3]).tolist(), rows.tolist(), number))
         return now + (number != 1) * np.isin(np.arange(300), rows)[:, None] * (0, 0, 0, 1)
 
-    def kept(first, meshes):
+    def kept(first, meshes, goes_on):
         meshes = iter(meshes)
 
-        def remake(now, last):
-            made.append((now[:, 3].sum(), last))
-            return next(meshes)
+        def rejected(mesh):
+            return np.array(mesh, int)
 
-        return fewest_rejected(first, state, np.ones(300), np.array, change, remake, 4)
+        return fewest_rejected(first, state, np.ones(300), rejected, change, lambda now, last: next(meshes), goes_on)
 
     first, better = [0, 1, 1, 100, 200], [0, 1, 200, -1]
-    assert kept(first, [better, [0, 0, 1, 200], None, [0, 1]]) == [0, 1]
+    assert kept(first, [better, [0, 0, 1, 200], None, [0, 1]], [False] * 4) == [0, 1]
     assert begun == [
         ([], [0, 1, 100, 200], 0),
         ([1, 100], [0, 1, 200], 1),
         ([1, 100], [0, 1, 200], 2),
         ([1, 100], [0, 1, 200], 3),
     ]
-    assert kept([], []) == []
+    begun.clear()
+    assert kept([0, 100], [[0, 0, 100], [100], []], [False, False, True, False]) == []
+    assert begun == [([], [0, 100], 0), ([], [0, 100], 1), ([0, 100], [0, 100], 2), ([0], [100], 3)]
+    assert kept([], [], [False]) == []

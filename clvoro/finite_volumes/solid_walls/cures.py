@@ -43,6 +43,8 @@ _TOO_MANY = 0.2
 _BUDGET, _MOST = 12, 1000
 """Most changes of a rejected cell before others have their turn, and most searches for cures in meshes that are made
 one after another."""
+_EACH = 6
+"""Most searches in one mesh, on average of its rejected cells: parts of a cell may be cut again and again."""
 _AHEAD = 1
 """Where no cure of a cell helps, cures of the cells that OpenFOAM rejects after it may follow: how many in turn."""
 _BRANCHES, _MOST_BAD = 2, 3
@@ -74,6 +76,8 @@ class Cures:
         The mesh with all changes that are kept.
     searches : int
         How often cures have been tried on a cell, also by the earlier cures.
+    most : int
+        The number of searches after which no cure is tried.
     """
 
     def __init__(
@@ -81,6 +85,7 @@ class Cures:
     ) -> None:
         self.surface, self.edits, self.names, self.sizes = surface, Edits(faces), names, sizes
         self.changes, self.searches, self.changed, self.tried = 0, 0, dict[int, int](), dict[int, int]()
+        self.most = _MOST
         self.excess: dict[int, tuple[int, float]] = {}
         self.judged: dict[tuple[Edits, int, bool], list[Option]] = {}
         if earlier is not None:
@@ -111,7 +116,7 @@ class Cures:
     def cure(self, cell: int) -> bool:
         """Make the best change to the mesh around a cell if it is rejected; return whether one helps."""
         edits = self.edits
-        if not edits.faces_of(cell) or self.tried.get(cell) == self.stamp(cell) or self.are_spent:
+        if not edits.faces_of(cell) or self.tried.get(cell) == self.stamp(cell) or self.searches >= self.most:
             return False
         self.measure([cell])
         if self.excess[cell][1] == 0:
@@ -462,6 +467,7 @@ def cured(
     if len(rejected) > _TOO_MANY * faces.n_cells:
         return faces, np.arange(faces.n_cells), own, rejected, None
     cures = Cures(surface, faces, names, sizes, earlier)
+    cures.most = min(_MOST, cures.searches + _EACH * len(rejected))
     todo, again = rejected.tolist(), True
     while again:
         again = False

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache
-from itertools import product
 
 import numpy as np
 import scipy
@@ -44,11 +43,10 @@ across it, over h."""
 _AROUND = 0.85
 """Generators nearer to a concave crease than this share of h stay: the faces between their cells meet in it."""
 _GOLDEN = (5**0.5 - 1) / 2
-_TRIALS = [(0, FILLED), (0, ROUNDED), (0, ROUNDED + 1), *product(range(1, 1 + MOVES), (EXACT, ROUNDED + 1))]
-"""The trials where cells are rejected: how often generators have moved, and how walls are made; with `ROUNDED + 1` also
-those of cells beside the rejected ones."""
+_SIMPLER, _SIMPLER_AFTER = 3, 2
+"""How often walls of rejected cells become simpler, at first and after each move of generators."""
 _BESIDE = 1.3
-"""How near these are, over h."""
+"""Distance over h up to which walls become simpler around rejected cells whose walls have no creases any more."""
 _CREASED = 3.0
 """Walls of a cell farther from all creases than this, over h, are the same however they are made."""
 _MISSED = 0.1
@@ -209,19 +207,20 @@ def solid_diagram(
         return _finished(surface, raw, None if last is None else last.cures, tell)
 
     def change(state: np.ndarray, rows: np.ndarray, number: int) -> np.ndarray:
-        # First walls become simpler, then generators move, too.
-        move, level = _TRIALS[number]
-        if move and len(rows) > FEW * len(state):
-            return state
         trial = state.copy()
-        if move:
-            trial[:, :3] = moved(surface.solid, depth, sizes, state[:, :3], rows, move - 1, held)
+        if not goes_on[number]:
+            if len(rows) > FEW * len(state):
+                return state
+            move = goes_on[:number].count(False)
+            trial[:, :3] = moved(surface.solid, depth, sizes, state[:, :3], rows, move, held)
+            trial[rows, 3] = EXACT
+            return trial
         creased = rows[surface.nearest_crease(state[rows, :3], _CREASED * sizes[rows])[0] >= 0]
-        if level > ROUNDED:
-            beside = scipy.spatial.KDTree(points).query_ball_point(points[creased], _BESIDE * sizes[creased])
-            creased = np.array(sorted(set().union(*beside)), np.int64)
-        trial[creased, 3] = min(level, ROUNDED)
-        return trial if len(creased) or not level else state
+        rounded = creased[state[creased, 3] == ROUNDED]
+        beside = scipy.spatial.KDTree(points).query_ball_point(points[rounded], _BESIDE * sizes[rounded])
+        creased = np.array(sorted({*creased.tolist()}.union(*beside)), np.int64)
+        trial[creased, 3] = np.minimum(state[creased, 3] + 1, ROUNDED)
+        return trial
 
     def depth(x: np.ndarray) -> np.ndarray:
         return -surface.closest(x)[2]
@@ -229,10 +228,11 @@ def solid_diagram(
     def rejected_generators(made: _Made) -> np.ndarray:
         return made.near.numbers[made.home[made.rejected]]
 
+    goes_on = [True] * _SIMPLER + MOVES * [False, *[True] * _SIMPLER_AFTER]
     state = np.column_stack([points, np.full(len(points), EXACT)])
     first = remake(state, None)
     assert first is not None
-    mesh = fewest_rejected(first, state, sizes, rejected_generators, change, remake, len(_TRIALS))
+    mesh = fewest_rejected(first, state, sizes, rejected_generators, change, remake, goes_on)
     near, points = mesh.near, mesh.near.points
     rejected = mesh.faces.generators[mesh.rejected]
     tell("cells without walls")
