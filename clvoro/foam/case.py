@@ -7,6 +7,7 @@ import ctypes
 import os
 import re
 import shutil
+import signal
 import subprocess
 from collections.abc import Iterator
 from pathlib import Path
@@ -273,9 +274,8 @@ class FoamCase:
                 words, cwd=self.folder, env=environment, stdout=file, stderr=file, pass_fds=self._lock, check=False
             )
         if code.returncode:
-            raise ClvoroError(
-                f"{solver} failed with code {code.returncode}: {log.read_text(errors='replace')[-_TAIL:]}\nsee {log}"
-            )
+            ended = signal.Signals(-code.returncode).name if code.returncode < 0 else f"code {code.returncode}"
+            raise ClvoroError(f"{solver} failed with {ended}: {log.read_text(errors='replace')[-_TAIL:]}\nsee {log}")
 
     def monitors(self) -> dict[str, float]:
         """Return the last values of the tables in ``postProcessing``, by function object and column."""

@@ -200,8 +200,8 @@ def adapt_case(
     effort : "fast", "default" or "best"
         As for `Adapter.run`.
     pictures : bool
-        Draw the mesh of each cycle, colored by the size of U, or of the first field, into ``clvoro/cycle-K.png``, and
-        all side by side into ``clvoro/cycles.png``. In space they are sections.
+        Draw the mesh of each cycle, colored by the size of the first field that it follows, into
+        ``clvoro/cycle-K.png``, and all side by side into ``clvoro/cycles.png``. In space they are sections.
     adapter : Adapter, optional
         By default the shared one, on the best device.
     on_cycle : callable, optional
@@ -535,7 +535,8 @@ class _Loop:
             return
         from matplotlib import image, pyplot
 
-        shown = min((one for one in fields if one.in_cells), key=lambda one: one.name != "U")
+        first = getattr(self.sizes, "fields", ["U"])[0]
+        shown = min((one for one in fields if one.in_cells), key=lambda one: one.name != first)
         values = old.to_diagram(shown.internal.rows(old.foam.n_cells))
         view = None if old.foam.is_plane else "slice"
         figure = old.diagram.plot(np.linalg.norm(values, axis=1), view, label=shown.name)
