@@ -16,11 +16,10 @@ from ..mesh.connectivity import distinct
 T = TypeVar("T")
 FEW = 0.03
 """Largest share of generators with rejected cells for which meshes are made again, and of generators without cells."""
-MOVES = 5
+MOVES = 8
 """Largest number of trials to move the generators of rejected cells."""
-_MOVE, _BESIDE = 0.05, 1.3
-"""Displacement of generators of rejected cells, which grows by this from trial to trial and is twice as much at first,
-and distance up to which others move as well, over h."""
+_STEPS, _BESIDE = (0.1, 0.15, 0.2, 0.25, 0.3), 1.3
+"""Displacements of generators of rejected cells, in turn, and distance up to which others move as well, over h."""
 _GROUP = 2.5
 """Distance over h up to which rejected cells are in one group."""
 _DEEP = 0.1
@@ -127,7 +126,7 @@ def moved(
     rows, points = np.unique(np.concatenate(beside).astype(np.int64)), points.copy()
     rows = rows[rows >= held]
     away = np.random.default_rng(move).normal(size=(len(rows), 3))
-    away *= ((2 + move) * _MOVE * sizes[rows] / np.linalg.norm(away, axis=1))[:, None]
+    away *= (_STEPS[move % len(_STEPS)] * sizes[rows] / np.linalg.norm(away, axis=1))[:, None]
     sheets = None if domain.borders is None else domain.borders.sheets
     group, room = np.arange(len(rows)), np.zeros(len(rows))
     if sheets is not None:
