@@ -1,9 +1,9 @@
 """A front that moves with the flow, on a mesh that follows it: error, conservation, extrema, and the number of cells.
 
-    python bench/following.py [--cells 1000,2000] [--cycles 50] [--uniform 1000,4000,16000] [--steps 21] [--width 0.02]
+    python bench/following.py [--cells 1000,2000] [--cycles 50] [--uniform 1000,4000,16000] [--steps 21]
                               [--picture FILE] [--device NAME] [--json]
 
-A disk with a smooth rim of the given width turns once around the middle of a square, in `--cycles` parts. After each
+A disk with a smooth rim turns once around the middle of a square, in `--cycles` parts. After each
 the sizes are those of `hessian_size` of the present solution and of the solution at the end of the next part, as if
 it only turned (`combine`); a run follows them (`Run.follow`) by at most `--steps` steps, and the solution is
 transferred by `Diagram.transfer`. The solver is of second order: linear functions in the cells, limited by Barth and
@@ -30,15 +30,15 @@ import clvoro
 from clvoro import sizing
 
 BOX = clvoro.Box((-1, -1), (1, 1))
-CENTER, RADIUS = np.array([0.5, 0.0]), 0.2
+CENTER, RADIUS, WIDTH = np.array([0.5, 0.0]), 0.2, 0.02
 COURANT = 0.4
 
 
-def disk(x: np.ndarray, angle: float, width: float) -> np.ndarray:
+def disk(x: np.ndarray, angle: float) -> np.ndarray:
     """Return the disk that has turned by `angle`, at points (n, 2)."""
     c, s = math.cos(angle), math.sin(angle)
     center = np.array([[c, -s], [s, c]]) @ CENTER
-    return 0.5 - 0.5 * np.tanh((np.hypot(*(x - center).T) - RADIUS) / width)
+    return 0.5 - 0.5 * np.tanh((np.hypot(*(x - center).T) - RADIUS) / WIDTH)
 
 
 class Advection:
@@ -96,9 +96,9 @@ class Advection:
         return u
 
 
-def means(mesh: clvoro.Diagram, angle: float, width: float) -> np.ndarray:
+def means(mesh: clvoro.Diagram, angle: float) -> np.ndarray:
     """Return the disk at the centroids, which is its mean over a cell to second order."""
-    return disk(mesh.centroids, angle, width)
+    return disk(mesh.centroids, angle)
 
 
 def sizes(u: np.ndarray, mesh: clvoro.Diagram, n: float, turn: float) -> sizing.Estimate:
@@ -132,15 +132,15 @@ class Clock:
         return {**self.parts, "seconds": wall, "cpu_seconds": cpu}
 
 
-def followed(adapter: clvoro.Adapter, n: int, cycles: int, steps: int, width: float) -> tuple[dict[str, Any], Any]:
+def followed(adapter: clvoro.Adapter, n: int, cycles: int, steps: int) -> tuple[dict[str, Any], Any]:
     """Return the record of a mesh that follows, and the last mesh with its data."""
     turn = 2 * math.pi / cycles
     run = adapter.start(BOX, 2 / math.sqrt(n), "fast", seed=FIRST_SEED)
     mesh = run.finish().diagram
     for _ in range(3):
-        run.follow(sizes(means(mesh, 0, width), mesh, n, turn))
+        run.follow(sizes(means(mesh, 0), mesh, n, turn))
         mesh = run.finish().diagram
-    u = means(mesh, 0, width)
+    u = means(mesh, 0)
     first, drift, mass, excess = len(mesh), 0.0, 0.0, 0.0
     taken, errors, qualities = [], [], []
     run = adapter.start(BOX, sizes(u, mesh, n, turn), "fast", points=mesh.points, seed=FIRST_SEED, max_steps=steps)
@@ -162,22 +162,22 @@ def followed(adapter: clvoro.Adapter, n: int, cycles: int, steps: int, width: fl
         excess = max(excess, v.max() - u.max(), u.min() - v.min())
         mesh, u = after.diagram, v
         drift = max(drift, abs(len(mesh) / first - 1))
-    record = {"kind": "followed", "cells": len(mesh), **_error(mesh, u, width), "mass": mass, "extrema": excess}
+    record = {"kind": "followed", "cells": len(mesh), **_error(mesh, u), "mass": mass, "extrema": excess}
     record |= {"drift": drift, "steps": float(np.median(taken)), "e": max(errors), "quality": min(qualities)}
     return record | clock.record(), (mesh, u)
 
 
-def uniform(adapter: clvoro.Adapter, n: int, width: float) -> dict[str, Any]:
+def uniform(adapter: clvoro.Adapter, n: int) -> dict[str, Any]:
     """Return the record of a uniform mesh."""
     mesh = adapter.run(BOX, 2 / math.sqrt(n), "fast", n_cells=n, seed=FIRST_SEED).diagram
     clock = Clock()
-    u = Advection(mesh).advance(means(mesh, 0, width), 2 * math.pi)
+    u = Advection(mesh).advance(means(mesh, 0), 2 * math.pi)
     clock.spent("solver")
-    return {"kind": "uniform", "cells": n, **_error(mesh, u, width), **clock.record()}
+    return {"kind": "uniform", "cells": n, **_error(mesh, u), **clock.record()}
 
 
-def _error(mesh: clvoro.Diagram, u: np.ndarray, width: float) -> dict[str, float]:
-    exact = means(mesh, 0, width)
+def _error(mesh: clvoro.Diagram, u: np.ndarray) -> dict[str, float]:
+    exact = means(mesh, 0)
     return {"l1": float(mesh.volumes @ np.abs(u - exact) / (math.pi * RADIUS**2))}
 
 
@@ -205,17 +205,16 @@ def main(arguments: list[str] | None = None) -> int:
     made.add_argument("--cycles", type=int, default=50)
     made.add_argument("--uniform", type=counts, default=counts("1000,4000,16000"))
     made.add_argument("--steps", type=int, default=21)
-    made.add_argument("--width", type=float, default=0.02)
     made.add_argument("--picture", type=Path, metavar="FILE")
     options = made.parse_args(arguments)
     adapter, report = make_adapter(options), Report(options.json, COLUMNS)
     for n in options.cells:
-        record, (mesh, u) = followed(adapter, n, options.cycles, options.steps, options.width)
+        record, (mesh, u) = followed(adapter, n, options.cycles, options.steps)
         report.add(record, f"followed, {n}")
         if options.picture:
             mesh.plot(u, label="u").savefig(options.picture, dpi=90)
     for n in options.uniform:
-        report.add(uniform(adapter, n, options.width), f"uniform, {n}")
+        report.add(uniform(adapter, n), f"uniform, {n}")
     report.finish(heading(adapter, f"A disk that turns once, {options.cycles} meshes"))
     return 0
 
