@@ -14,7 +14,8 @@ absolute: no common factor is removed. With `--processor-time`, seconds are proc
 The 3D fields S1, S2 and S3 have a separate table. Quality is the isoperimetric quotient 36 pi V^2 / S^3
 (.753 for the truncated octahedron), and "finest steps" counts the steps of the finest level alone.
 
-Two groups of rows run if they are named. "targets" are error targets of the default. "JIGSAW" are runs with at most
+Three groups of rows run if they are named. "coast" are runs in a lake with an island, of 10,000 edges. "walls" are the
+figures of its cells on the boundary. "targets" are error targets of the default. "JIGSAW" are runs with at most
 half the mean |e| of JIGSAW 1.0, whose quality they are to exceed: its default settings stand against "default", 64
 optimization passes against "best". Figures of JIGSAW are given, not measured here: on F3 itself, else on two circles
 and a ridge with other constants (7,270 and 5,776 cells, slopes from 0.15 to 0.25), so that one of our fields is less
@@ -38,11 +39,13 @@ from _common import (
     heading,
     make_adapter,
     names,
+    off_walls,
     parser,
     spread,
     test_field,
     work,
 )
+from _sites import rough_lake
 
 import clvoro
 from clvoro.adaptation.tuning import EXACT_STEPS, EXACT_STEPS_3D
@@ -65,19 +68,24 @@ class Row:
         Of `Adapter.run`.
     targets : dict
         Figure -> bound.
+    on_coast : bool
+        In a lake in place of a box.
     """
 
     name: str
     fields: tuple[str, ...]
     arguments: dict[str, Any]
     targets: dict[str, float] = field(default_factory=dict)
+    on_coast: bool = False
 
     @property
     def label(self) -> str:
         """The name, and the effort and the error target of a row that has one."""
         options = self.arguments.get("options")
         target = getattr(options, "error_target", None)
-        effort = self.arguments.get("effort", "default")
+        effort = self.arguments.get("effort", self.arguments.get("method", "default"))
+        if self.on_coast:
+            return f"{self.name}: {effort}"
         return self.name if target is None else f"{self.name}: {effort}, error target {target:g}"
 
 
@@ -93,7 +101,7 @@ def beside_jigsaw(fields: tuple[str, ...], effort: str, target: float, error: fl
     return aimed("JIGSAW", fields, effort, target, **goals)
 
 
-ASKED = ("targets", "JIGSAW")
+ASKED = ("targets", "JIGSAW", "coast")
 """Rows that run if they are named."""
 CIRCLES, RIDGES = ("circles", "steep circles"), ("ridge", "steep ridge")
 
@@ -107,6 +115,10 @@ EXACT = {
     "exact_iterations": 50,
 }
 KINKED = {"mean_error": 0.015, "max_error": 0.25, "mean_quality": 0.985, "min_quality": 0.92}
+COAST = {"mean_error": 0.006, "max_error": 0.06, "mean_quality": 0.980}
+COAST_KINKED = {"mean_error": 0.015, "max_error": 0.25, "mean_quality": 0.985}
+COAST_EXACT = {"mean_deviation": 1.5e-4, "max_deviation": 3e-3, "mean_quality": 0.976}
+AT_WALLS = {"wall_error": 0.006}
 SOLID_DEFAULT = {"mean_error": 0.012, "max_error": 0.08, "mean_quality_all": 0.69, "finest_steps": 12}
 SOLID_EXACT = {"mean_deviation": 3e-4, "max_deviation": 5e-3, "mean_quality_all": 0.67, "finest_steps": 15}
 WEIGHTED = {"method": "weighted", "options": clvoro.PaperOptions(tol=0)}
@@ -136,6 +148,10 @@ ROWS = (
     Row("fast", ("F2", "F3", "F4"), {"effort": "fast"}, {"mean_error": 0.006, "mean_quality": 0.975, "work": 15}),
     Row("exact", ("F1",), {"method": "exact"}, {"max_deviation": 1e-3, "mean_quality": 0.965}),
     Row("exact", ("F2", "F3", "F4"), {"method": "exact"}, EXACT),
+    Row("coast", ("F2",), {"effort": "fast"}, {"mean_error": 0.009, "mean_quality": 0.965}, True),
+    Row("coast", ("F2", "F3"), {}, COAST | AT_WALLS, True),
+    Row("coast", ("F2",), {"method": "exact"}, COAST_EXACT, True),
+    Row("coast", (*CIRCLES, *RIDGES), {}, COAST_KINKED | AT_WALLS, True),
     Row("fast", ("S1", "S2", "S3"), {"effort": "fast"}),
     Row("default", ("S1",), {}),
     Row("default", ("S2", "S3"), {}, SOLID_DEFAULT),
@@ -153,7 +169,8 @@ def is_solid(name: str) -> bool:
 def measure(adapter: clvoro.Adapter, row: Row, name: str, seed: int, clock: Callable[[], float]) -> dict[str, float]:
     """Run `row` on the field of that name and return its figures."""
     start = clock()
-    result = adapter.run(domain_of(name), test_field(name), seed=seed, **row.arguments)
+    domain = rough_lake(10_000) if row.on_coast else domain_of(name)
+    result = adapter.run(domain, test_field(name), seed=seed, **row.arguments)
     seconds = clock() - start
     history = result.history
     measured = {
@@ -163,6 +180,16 @@ def measure(adapter: clvoro.Adapter, row: Row, name: str, seed: int, clock: Call
         "iterations": int(history["iterations"].sum()),
         "finest_steps": int((np.diff(history["step"]) * (history["level"][1:] == 0)).sum()),
     }
+    if row.on_coast:  # sizes are those of cells with straight walls
+        error, walls = np.abs(result.size_error), ~off_walls(result.diagram)
+        measured |= {
+            **dict.fromkeys(("mean_error", "mean_deviation"), float(error.mean())),
+            **dict.fromkeys(("max_error", "max_deviation"), float(error.max())),
+            "wall_cells": int(walls.sum()),
+            "wall_error": float(error[walls].mean()),
+            "wall_quality": float(result.quality[walls].mean()),
+            "wall_least": float(result.quality[walls].min()),
+        }
     if row.arguments.get("method") == "exact":
         steps = EXACT_STEPS_3D if is_solid(name) else EXACT_STEPS
         measured["exact_steps"] = steps
@@ -194,6 +221,7 @@ def show(figure: str, form: str) -> Any:
     return text
 
 
+WALLS = {"cells": ".0f", "error": ".4f", "quality": ".4f", "least": ".3f"}
 COLUMNS = {
     "row": lambda r: r["row"],
     "field": lambda r: r["field"],
@@ -203,6 +231,9 @@ COLUMNS = {
     "mean Q": show("mean_quality", ".4f"),
     "min Q": show("min_quality", ".3f"),
     "all Q": lambda r: f"{show('mean_quality_all', '.4f')(r)} / {show('min_quality_all', '.3f')(r)}",
+    "walls: cells, mean |e|, Q, min Q": lambda r: ", ".join(
+        filter(None, (show(f"wall_{name}", form)(r) for name, form in WALLS.items()))
+    ),
     "six-sided": show("six_sided", ".1%"),
     "mean |L/h-1|": show("mean_deviation", ".1e"),
     "max |L/h-1|": show("max_deviation", ".1e"),

@@ -2,7 +2,6 @@
 
     python bench/precision.py [--fields circle,point,sphere] [--sizes 1e4,1e6] [--grading 1000]
                               [--efforts fast] [--seeds 3] [--device NAME] [--json]
-    python bench/precision.py --noise
 
 The size grows linearly from its smallest to its largest value, whose ratio is the grading: away from the circle of
 radius 0.3 about (0.9, 0.75) in the box 2.5 x 1.5, from that circle's center alone ("point"), or from the sphere
@@ -11,8 +10,6 @@ float64, at the generators as they are; medians over the starts. "spacing" is th
 float32 over h, at the smallest size and as a mean over the cells. "more" is what float32 adds to the mean
 error, "scatter" the range of the error in float64 over the starts. The script returns 1 if "more" exceeds 1e-3 and the
 scatter without a warning before the run.
-`--noise` moves the generators of uniform meshes at random by a small distance, and prints the change of the error over
-that distance: `clvoro.adaptation.diagnostics.ROUND_OFF_ERROR`.
 """
 
 from __future__ import annotations
@@ -23,7 +20,6 @@ import warnings
 from argparse import Namespace
 from typing import Any
 
-import numpy as np
 from _common import BOX, CUBE, FIRST_SEED, Report, counts, figures, heading, make_adapter, names, parser
 
 import clvoro
@@ -73,19 +69,6 @@ def measure(options: Namespace, name: str, n: int, effort: str) -> dict[str, Any
     return record
 
 
-def noise(options: Namespace) -> None:
-    """Print by what share of half a spacing the error of a uniform mesh changes when generators are rounded."""
-    for box, h in ((clvoro.Box((0, 0), (1, 1)), 0.02), (CUBE, 0.08)):
-        adapter = make_adapter(Namespace(device=options.device, dtype="float64"))
-        result = adapter.run(box, h, effort="fast", seed=FIRST_SEED)
-        for off in (1e-3, 1e-2, 1e-1):
-            by = np.random.default_rng(FIRST_SEED).uniform(-off, off, result.points.shape) * h
-            moved = adapter.diagram(box, np.clip(result.points + by, box.lower, box.upper))
-            length = moved.volumes ** (1 / box.dim)
-            change = (length - h) / np.minimum(length, h) - result.size_error
-            print(f"{box.dim}D, off by up to {off} h: e changes by {np.abs(change).mean() / (2 * off):.3f} spacings")
-
-
 def main() -> int:
     options_of = parser(__doc__)
     options_of.add_argument("--fields", type=names, default=["circle", "point"])
@@ -93,11 +76,7 @@ def main() -> int:
     options_of.add_argument("--efforts", type=names, default=["fast"])
     options_of.add_argument("--grading", type=float, default=1000.0, help="largest over least size")
     options_of.add_argument("--seeds", type=int, default=1, help="random starts of each run (1)")
-    options_of.add_argument("--noise", action="store_true", help="measure what rounding does to e")
     options = options_of.parse_args()
-    if options.noise:
-        noise(options)
-        return 0
 
     def pair(figure: str, digits: int) -> Any:
         return lambda r: " / ".join(f"{r[f'{real}_{figure}']:.{digits}f}" for real in ("float64", "float32"))

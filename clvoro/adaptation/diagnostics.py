@@ -27,7 +27,7 @@ STEEP = 1.25
 """Ratio of the sizes of adjacent cells above which a size error is attributed to the growth of h."""
 ROUND_OFF_ERROR = 0.1
 """Mean |e| because of round-off, over the ratio of the spacing of positions to h. Random changes of up to half a
-spacing cost 0.095 (0.07 in 3D) times this ratio (`bench/precision.py --noise`)."""
+spacing cost 0.095 (0.07 in 3D) times this ratio (`tests/adaptation/test_precision.py`)."""
 MAX_ROUND_OFF_ERROR = 1e-3
 """Mean |e| because of round-off above which a run warns."""
 SHORTEST_EDGE, MAX_EDGE_ERROR = 0.13, 1e-4

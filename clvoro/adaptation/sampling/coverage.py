@@ -222,11 +222,10 @@ class SolidCoverage(CutCoverage):
         self.share[rows] = inside @ self._weight
         first = np.argsort(np.abs(at - 0.5).max(axis=1), kind="stable")  # samples near the center are preferred
         best = first[inside[:, first].argmax(axis=1)]
-        any_inside = inside.any(axis=1)
-        self.inner[rows[any_inside]] = x[np.arange(len(rows)), best][any_inside]
+        good = np.asarray(inside.any(axis=1))
+        self.inner[rows[good]] = x[np.arange(len(rows)), best][good]
         # A part thinner than the distance of samples, or one on the surface: a point just inside of it.
         depth = 1e-3 * (corners[:, 1] - corners[:, 0]).min(axis=1)
-        good = any_inside
         good[good] = self.domain.contains_well(self.inner[rows[good]], 1e-6 * depth.min())
         thin = np.flatnonzero(~good)
         found = self.domain.just_inside(self.inner[rows[thin]], depth[thin])
