@@ -150,8 +150,8 @@ def test_a_table_is_markdown():
 @pytest.mark.slow
 @pytest.mark.skipif(shutil.which("simpleFoam") is None, reason="needs OpenFOAM")
 def test_cylinder():
-    rows = records("cylinder.py", "--cells", "1500", "--meshers", "clvoro; clvoro, layers; blockMesh; followed")
-    assert [r["mesher"] for r in rows] == ["clvoro", "clvoro, layers", "blockMesh", "followed"]
+    rows = records("cylinder.py", "--cells", "1500", "--meshers", "clvoro; clvoro, layers; blockMesh; followed, forces")
+    assert [r["mesher"] for r in rows] == ["clvoro", "clvoro, layers", "blockMesh", "followed, forces"]
     # In percent: 0.1, 0.1 and 0.6 for drag, and at most 3 for the pressure difference.
     assert all(abs(r["drag"][0]) < 0.8 for r in rows)
     assert all(abs(r["pressure"][0]) < 4 for r in rows)
