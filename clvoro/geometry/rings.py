@@ -403,7 +403,7 @@ def _check_valid(shape: Any, rings: Sequence[Ring]) -> None:
     ]
     more = len(there) - _NAMED
     where = " and ".join([*there[:_NAMED], *([f"edges of {more} more rings"] if more > 0 else [])])
-    remedy = "correct it, as Polygon(..., repair=True) does, also in Polygon.from_shapely and the like"
+    remedy = "correct it, as Polygon(..., repair=True) does, from_shapely and the like, or repair = true in a case"
     if shape.geom_type == "MultiPolygon":  # each piece is valid
         remedy = _UNITE
     remedy = _REMEDIES.get(reason, remedy)

@@ -53,6 +53,16 @@ def test_simplified_domains(tmp_path) -> None:
         Case.from_toml(creek.replace("0.1\n", "0\n") + SIZE, "my.toml")
 
 
+def test_rings_that_cross_are_repaired_on_request(tmp_path) -> None:
+    (tmp_path / "bow.wkt").write_text("POLYGON ((0 0, 2 2, 2 0, 0 2, 0 0))")
+    for domain in ("polygon = 'bow.wkt'\n", "outer = [[0, 0], [2, 2], [2, 0], [0, 2]]\n"):
+        with pytest.raises(InputError, match="repair = true"):
+            Case.from_toml(f"[domain]\n{domain}" + SIZE, "my.toml", tmp_path)
+        with pytest.warns(clvoro.errors.MismatchWarning, match="were repaired"):
+            case = Case.from_toml(f"[domain]\n{domain}repair = true\n" + SIZE, "my.toml", tmp_path)
+        assert case.domain.measure == pytest.approx(2)
+
+
 def test_curves_as_rings() -> None:
     text = (
         "[domain]\nouter = { kind = 'circle', center = [1, 2], radius = 3, name = 'far' }\n"

@@ -566,6 +566,7 @@ class PolygonTable(Kind, tag="polygon"):
     outer: Ring | None = None
     holes: list[Ring] | None = None
     names: Names | None = None
+    repair: bool = False
     simplified: Positive | None = None
     lines: Text | list[Line] | None = None
 
@@ -581,8 +582,8 @@ class PolygonTable(Kind, tag="polygon"):
 
     def _whole(self, folder: Path) -> Polygon:
         if self.file is None:
-            return Polygon(_ring(self.outer), [_ring(hole) for hole in self.holes or []], self.names)
-        return read_polygon(locate(folder, self.file), "domain.polygon", self.names)
+            return Polygon(_ring(self.outer), [_ring(hole) for hole in self.holes or []], self.names, self.repair)
+        return read_polygon(locate(folder, self.file), "domain.polygon", self.names, repair=self.repair)
 
 
 class SphereTable(Kind, tag="sphere"):
@@ -650,7 +651,9 @@ def with_kind(domain: object, place: str) -> object:
     return {"kind": "polygon" if rings else "box", **named}
 
 
-def read_polygon(path: Path, key: str, names: Names | None = None, planar: bool = True) -> Polygon:
+def read_polygon(
+    path: Path, key: str, names: Names | None = None, planar: bool = True, repair: bool = False
+) -> Polygon:
     """Read polygons from a file of GeoJSON or well-known text; `key` names it in the case.
 
     Raises
@@ -664,13 +667,13 @@ def read_polygon(path: Path, key: str, names: Names | None = None, planar: bool 
         )
     if path.suffix.lower() not in (".wkt", ".txt"):
         if planar:
-            return Polygon.from_geojson(path, names)
+            return Polygon.from_geojson(path, names, repair)
         return Polygon.from_pieces(pieces_of_geojson(path, planar=False)[0])
     try:
         text = read_text(path, LONGEST_GEOMETRY)
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"cannot read {path} ({error}), expected well-known text") from error
-    return Polygon.from_wkt(text, names)
+    return Polygon.from_wkt(text, names, repair)
 
 
 # The case.
