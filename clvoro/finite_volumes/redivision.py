@@ -15,7 +15,7 @@ import numpy as np
 from ..geometry.polygon import Polygon
 from ..mesh.faces import Faces
 from ..mesh.straightening import cross
-from .gate import not_convex
+from .gate import not_convex, rejected_polygons
 from .measures import PlaneMeasures
 from .short_edges import STRAIGHT
 
@@ -32,6 +32,8 @@ LEAST_SHARE = 0.15
 FLAT, MOST_FILLED = 1e-3, (0.1, 1.0)
 """Largest turn to the left, in radians, of a wall that is made straight. Largest area that a polygon gains there, over
 its own: 1.0 is for cells that no cut with 0.1 helps."""
+MOVED = (1e-3, 0.02, 0.1)
+"""Where corners go in which a cell is not convex: beyond the line between their neighbors, as shares of its length."""
 SHARPEST = 0.1
 """Least sine of the angles between a cut and the sides on which it ends."""
 TRIED = 24
@@ -40,8 +42,8 @@ RINGS = 2
 """Rings of cells, around the two that are divided, whose faces are computed. Scores leave out the outermost ring."""
 FAR = 10
 """Number of nearest cells of which one may be cut for a rejected cell, if cuts of its neighbors do not help."""
-ROUNDS = 4
-"""How often the cells that are bad then are divided anew, at most."""
+ROUNDS = 16
+"""How often cells that are bad are divided anew, at most."""
 
 Side = tuple[int, int, int]
 """First and last point of a side, counter-clockwise around its cell, and the cell beyond; on a wall -1 - wall."""
@@ -49,8 +51,8 @@ Loops = dict[int, list[Side]]
 """The sides of each cell, by its number."""
 
 
-def redivide(mesh: Faces, parts: np.ndarray, rejected: np.ndarray) -> Faces:
-    """Return `mesh` with the cells `rejected` (n,) bool, and those of a small determinant, divided anew where it helps.
+def redivide(mesh: Faces, parts: np.ndarray) -> Faces:
+    """Return `mesh` with the cells that OpenFOAM rejects, and those of a small determinant, divided anew if it helps.
 
     Parameters
     ----------
@@ -59,8 +61,8 @@ def redivide(mesh: Faces, parts: np.ndarray, rejected: np.ndarray) -> Faces:
     parts : (k,) int
         Index of the named part of the boundary for each wall.
     """
+    rejected = rejected_polygons(mesh) | (PlaneMeasures(mesh).determinant < WORST["determinant"])
     for _ in range(ROUNDS):
-        rejected = rejected | (PlaneMeasures(mesh).determinant < WORST["determinant"])
         if not rejected.any() or mesh.n_cells < 3:
             return mesh
         edit = _Edit(mesh, parts)
@@ -105,7 +107,7 @@ class _Cut(NamedTuple):
 
 
 class _Change(NamedTuple):
-    """The sides of cells after a change, and the places of its new points, which have negative numbers."""
+    """The sides of cells after a change, and places of points: moved ones, and new ones, with negative numbers."""
 
     loops: Loops
     points: dict[int, np.ndarray]
@@ -150,22 +152,28 @@ class _Edit:
         for most in MOST_FILLED:
             if self._try(cell, near, True, most) or self._try(cell, near, False, most):
                 return
+        if self._try(cell, near[:1], None):
+            return
         order = np.argsort(((self.old.generators - self.old.generators[cell]) ** 2).sum(axis=1), kind="stable")
         self._try(cell, [c for c in order[1:FAR].tolist() if c not in near], False, MOST_FILLED[-1])
 
-    def _try(self, cell: int, others: list[int], union: bool, most: float) -> bool:
+    def _try(self, cell: int, others: list[int], union: bool | None, most: float = 0.0) -> bool:
         """Divide a cell and one of `others` anew if fewer cells are bad then; return whether that is so.
 
         With `union` the two cells together are cut. Without it the other one alone is cut, and walls take the place of
         `cell`. The cut taken leaves the fewest bad cells, and of such cuts the one whose worst cell is the best.
-        `most` is one of `MOST_FILLED`.
+        `most` is one of `MOST_FILLED`. With None instead of `union` corners of `cell` are moved; see `MOVED`.
         """
         best: tuple[tuple[int, float], _Change] | None = None
         for other in others:
             local, judged = self._around(cell, other)
-            outline, walled = (self._union(cell, other), {}) if union else self._without(cell, other, local)
-            cuts = self._cuts(self._straightened(outline, most)) if len(outline) > 2 else []
-            made = [_Change(local, {}), *(self._changed(cell, other, cut, {**local, **walled}) for cut in cuts)]
+            made = [_Change(local, {})]
+            if union is None:
+                made += [_Change(local, new) for new in self._moves(cell)]
+            else:
+                outline, walled = (self._union(cell, other), {}) if union else self._without(cell, other, local)
+                cuts = self._cuts(self._straightened(outline, most)) if len(outline) > 2 else []
+                made += [self._changed(cell, other, cut, {**local, **walled}) for cut in cuts]
             (count, _), *scores = self._scores(made, judged)
             for (left, worst), change in zip(scores, made[1:], strict=True):
                 if left < count and (best is None or (left - count, worst) < best[0]):
@@ -173,12 +181,30 @@ class _Edit:
         if best is None:
             return False
         change = best[1]
-        place = {name: len(self.points) + k for k, name in enumerate(change.points)}
-        self.points += change.points.values()
+        new = [name for name in change.points if name < 0]
+        place = {name: len(self.points) + k for k, name in enumerate(new)}
+        self.points += [change.points[name] for name in new]
+        moved = change.points.keys() - new
+        for name in moved:
+            self.points[name] = change.points[name]
         for c, loop in change.loops.items():
-            if loop != self.sides_of(c):
+            if loop != self.sides_of(c) or any(side[0] in moved for side in loop):
                 self.changed[c] = [(place.get(a, a), place.get(b, b), other) for a, b, other in loop]
         return True
+
+    def _moves(self, cell: int) -> list[dict[int, np.ndarray]]:
+        """Return places for all corners where `cell` is not convex, by number."""
+        loop, found = self.sides_of(cell), []
+        for share in MOVED:
+            new: dict[int, np.ndarray] = {}
+            for (a, p, _), (_, b, _) in zip(loop, [*loop[1:], loop[0]], strict=True):
+                x, y, z = (new.get(k, self.points[k]) for k in (a, p, b))
+                way = z - x
+                off = ((y - x)[0] * way[1] - (y - x)[1] * way[0]) / (way @ way)
+                if off < STRAIGHT:
+                    new[p] = y + (share - off) * np.array([way[1], -way[0]])
+            found += [new] if new else []
+        return found
 
     def _around(self, *cells: int) -> tuple[Loops, list[int]]:
         """Return the sides of `cells` and of `RINGS` around them, and the cells without those of the outermost ring."""
@@ -324,7 +350,7 @@ class _Edit:
                         for p in (a, b):
                             if p not in known:
                                 known[p] = len(x)
-                                x.append(new[p] if p < 0 else self.points[p])
+                                x.append(new[p] if p in new else self.points[p])
                         ends.append((known[a], known[b]))
                         owner.append(base + place[c])
                         neighbor.append(base + place[other] if other in place else -1)

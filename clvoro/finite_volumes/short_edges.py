@@ -12,15 +12,12 @@ from ..mesh.connectivity import following, independent, take_rows
 from ..mesh.faces import Faces
 from ..mesh.geometry import polygon_areas, smaller_size, turns
 from ..mesh.straightening import cross
-from .measures import PlaneMeasures
 from .prisms import simple_loops
 
 SHORT, THIN = 0.055, 0.2
 """A face is short if it is shorter than both, over the smaller size of its cells and over the width of the thinner one.
 
 Between columns of boundary layers cells are much longer than wide: there the second one holds."""
-SKEW, LONGEST = 2.0, 0.3
-"""Faces with a larger skewness, or with an end where a cell is not convex, may be so long, in place of `SHORT`."""
 STRAIGHT = 2e-5
 """Least turn in a corner of a convex cell; OpenFOAM counts cells with less than about 1e-6 as concave."""
 _ROUNDS = 12
@@ -85,14 +82,9 @@ class _Round:
         self.starts, self.loop, broken = simple_loops(mesh)
         self.cell = np.repeat(np.arange(mesh.n_cells), np.diff(self.starts))
         self.images = mesh.images if any(mesh.domain.periodic) else np.arange(v)
-        self.kind = point_kinds(mesh, parts, self.images)
-        ratio, longer = _lengths_over_limits(mesh, broken)
+        self.kind = _point_kinds(mesh, parts, self.images)
+        ratio = _lengths_over_limits(mesh, broken)
         ends = mesh.corners.reshape(-1, 2)
-        if not broken.size:
-            bent = np.zeros(v, bool)
-            bent[self.loop[turns(mesh.points[self.loop], following(self.starts)) < STRAIGHT]] = True
-            bad = bent[ends].any(axis=1) | (PlaneMeasures(mesh).skewness > SKEW)
-            ratio[bad] = longer[bad]
         first, second = self.images[ends].T
         # One side of each seam; no face between cells that joins two walls, and none on a wall between two corners.
         tried = (ratio < 1) & (mesh.twin < np.arange(len(ends))) & (first != second)
@@ -209,8 +201,8 @@ class _Round:
         return made.take_faces(ends[:, 0] != ends[:, 1]).compact()
 
 
-def _lengths_over_limits(mesh: Faces, broken: np.ndarray) -> list[np.ndarray]:
-    """Return the length of each face over that below which it is short, (f,), for `SHORT` and for `LONGEST`.
+def _lengths_over_limits(mesh: Faces, broken: np.ndarray) -> np.ndarray:
+    """Return the length of each face over that below which it is short, (f,).
 
     The width of a cell is 4 times its area over its perimeter; `broken` are cells that are no simple polygons.
     """
@@ -218,20 +210,17 @@ def _lengths_over_limits(mesh: Faces, broken: np.ndarray) -> list[np.ndarray]:
     lengths = np.linalg.norm(b - a, axis=1)
     both = np.concatenate([mesh.owner, mesh.neighbor[: mesh.n_inner]])
     perimeter = np.bincount(both, np.concatenate([lengths, lengths[: mesh.n_inner]]), mesh.n_cells)
-    area, found = np.maximum(polygon_areas(mesh), 0), []
-    for short in (SHORT, LONGEST):
-        limit = np.minimum(short * np.sqrt(area), THIN * 4 * area / np.maximum(perimeter, 1e-300))
-        limit[broken] = 0
-        found.append(lengths / np.maximum(smaller_size(mesh.owner, mesh.neighbor, limit), 1e-300))
-    return found
+    area = np.maximum(polygon_areas(mesh), 0)
+    limit = np.minimum(SHORT * np.sqrt(area), THIN * 4 * area / np.maximum(perimeter, 1e-300))
+    limit[broken] = 0
+    return lengths / np.maximum(smaller_size(mesh.owner, mesh.neighbor, limit), 1e-300)
 
 
-def point_kinds(mesh: Faces, parts: np.ndarray, images: np.ndarray | None = None) -> np.ndarray:
+def _point_kinds(mesh: Faces, parts: np.ndarray, images: np.ndarray) -> np.ndarray:
     """Return whether each point is free, on a wall, or fixed in a corner, (v,) int.
 
-    `images` (v,) int is the class of each point, if points are periodic images of one another.
+    `images` (v,) int is the class of each point; points of a class are periodic images of one another.
     """
-    images = np.arange(len(mesh.points)) if images is None else images
     walls = slice(mesh.n_inner, mesh.n_outer)
     a, b = mesh.corners.reshape(-1, 2)[walls].T
     part = parts[-1 - mesh.neighbor[walls]]

@@ -73,23 +73,14 @@ def _made(diagram: Diagram, walls: WallShape, collapse: bool, parts: np.ndarray)
 
 def _in_polygon(diagram: Diagram, outline: Polygon, parts: np.ndarray, collapse: bool) -> Faces:
     """Return the mesh with straight walls: cells divided anew where OpenFOAM would reject them."""
-    from .gate import rejected_polygons
     from .redivision import redivide
-    from .relaxation import relax_bad_faces
     from .short_edges import collapse_short_edges
     from .walls import straight_walls
 
     mesh = straight_walls(diagram, outline, parts)
     if not collapse:
         return mesh.compact()
-    mesh = collapse_short_edges(mesh, parts).compact()
-    rejected = np.zeros(mesh.n_cells, bool)
-    for _ in range(_ROUNDS):
-        mesh = relax_bad_faces(redivide(mesh, parts, rejected), parts)
-        rejected = rejected_polygons(mesh)
-        if not rejected.any():
-            break
-    return mesh
+    return redivide(collapse_short_edges(mesh, parts).compact(), parts)
 
 
 def _collapsed_polygons(mesh: Faces, diagram: Diagram, parts: np.ndarray, collapse: bool) -> Faces:

@@ -63,6 +63,17 @@ def test_a_cell_in_a_lagoon_is_accepted(ctx):
     assert diagram.check(solver="openfoam")
 
 
+def test_a_corner_between_an_inner_face_and_a_wall_moves(ctx):
+    """A cell goes around an island; no cut of it, nor of it and a neighbor, helps."""
+    island = [(23, 24), (24, 24), (24, 25), (23, 25)]
+    sea = [(20.5, 22.5), (26, 22.5), (26, 26), (20.5, 26), (20.5, 24), (22, 24), (22, 23), (20.5, 23)]
+    points = [(24.56, 23.47), (24.18, 25.19), (24.54, 22.51), (22.43, 25.42)]
+    diagram = clvoro.Adapter(ctx).diagram(clvoro.Polygon(sea, [island]), points)
+    with pytest.warns(MismatchWarning):
+        assert diagram.check(solver="openfoam")
+    assert max(map(concave_by, polygons(diagram.solver_mesh()))) < 0
+
+
 def test_cells_in_a_throat_and_without_neighbors_take_a_part_of_others(ctx):
     """One cell lies on both sides of a throat of 1e-8, and two in a slit behind it, which no face leaves."""
     left, right = 1.5 - 5e-9, 1.5 + 5e-9
