@@ -22,10 +22,11 @@ error of the uniform mesh over it, and "predicted" the error that the last sizes
 
 Three more columns say how much of this is due to sizes and how much to shapes. "sizes" is the error over the optimum if
 all simplices were regular, with the volumes of the mesh's cells, at random places in them. L1 and L2, divided by
-"sizes", are the factors due to shapes. "bound" is the least value of "sizes" for this number of cells, with any
-growth of sizes. It is above 1 where cells are larger than the layer, since the optimum holds for many cells. A mesh
-whose cells are not at random places can be better. With `--exact` the sizes come from the function's own second
-derivatives, averaged over a ball of the size of a cell: the difference is what the estimate costs.
+"sizes", are the factors due to shapes. "bound" is the least value of "sizes" for this number of cells and this
+growth, with sizes that depend on the distance from the layer alone. It is above 1 where cells are larger than the
+layer, since the optimum holds for many cells. A mesh whose cells are not at random places can be better. With `--exact`
+the sizes come from the function's own second derivatives, averaged over a ball of the size of a cell: the difference is
+what the estimate costs.
 """
 
 from __future__ import annotations
@@ -41,6 +42,7 @@ from typing import Any
 import numpy as np
 from _common import FIRST_SEED, Report, heading, make_adapter, names, parser, shown
 from _remeshers import MESHERS, MissingPeerError, remesh
+from scipy.interpolate import CubicSpline
 from scipy.spatial import ConvexHull, Delaunay
 from scipy.stats import qmc
 
@@ -54,8 +56,8 @@ TARGET = {2: 1.15, 3: 1.25}
 BATCH = 4_000_000
 SAMPLES = 1 << 16
 ROUNDS = 24
-PLACES, TRIES, TOGETHER = 4000, 6, 50
-"""Number of places at which the best sizes are sought, of simplices at each, and of successive places with one size."""
+SHELLS, PLACES, MOST_SAMPLES = 128, 512, 1 << 20
+"""Shells with one best size each, simplices in each of them, and samples that fill them."""
 PER_CELL = {2: 2, 3: 6}
 """Simplices for each point of a hexagonal or a body-centered lattice."""
 BALL = {2: math.pi**-0.5, 3: (0.75 / math.pi) ** (1 / 3)}
@@ -87,7 +89,7 @@ class Space:
     @cache  # noqa: B019 - the same function for the same name, since `optimum` keeps its results
     def function(self, name: str) -> Function:
         """Return a function of positions (..., d)."""
-        return lambda x: FUNCTIONS[name](x, np.linalg.norm(x - np.array(self.center), axis=-1) - 0.6)
+        return lambda x: FUNCTIONS[name](x, self.distance(x) - 0.6)
 
     def unknowns(self, mesh: clvoro.Diagram) -> np.ndarray:
         """Return the generators, with the points on walls that close their triangulation."""
@@ -126,9 +128,17 @@ class Space:
         east = np.column_stack([-np.sin(angle), np.cos(angle), 0 * angle])
         return np.stack([east, np.cross(x, east)], axis=1)
 
-    def samples(self) -> np.ndarray:
+    def distance(self, x: np.ndarray) -> np.ndarray:
+        """Return the distances (n,) of points (n, D) from the center."""
+        return np.linalg.norm(x - np.array(self.center), axis=-1)
+
+    def along(self, r: np.ndarray) -> np.ndarray:
+        """Return lengths of the ways along the domain that lead to distances `r` (n,)."""
+        return 2 * np.arcsin(np.minimum(r / 2, 1)) if self.is_sphere else r
+
+    def samples(self, count: int = SAMPLES) -> np.ndarray:
         """Return points that fill the domain evenly, (n, D)."""
-        t = qmc.Sobol(self.dim, seed=1).random(SAMPLES)
+        t = qmc.Sobol(self.dim, seed=1).random(count)
         if not self.is_sphere:
             return t
         z, angle = 2 * t[:, 0] - 1, 2 * np.pi * t[:, 1]
@@ -247,33 +257,72 @@ def simplex_errors(
 
 
 @cache
-def best_error(space: Space, u: Function, p: int, n: int) -> float:
-    """Return the least L^p error of regular simplices at random places, for all sizes h(r) of `n` cells.
+def error_profile(space: Space, u: Function, p: int, n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return shells around the center: distances (k,), volumes (k,), sizes (m,), and errors (2, k, m).
 
-    At each distance r from the circle or ball h minimizes |error|^p + c h^-d; c follows from the number of cells.
+    Errors are means of |error|^p on regular simplices at random places in the shell. Those of two independent halves of
+    the places are apart. Half of the shells have equal volumes, half equal numbers of cells of the optimum.
     """
-    d, rng, x = space.dim, np.random.default_rng(6), space.samples()
+    d, rng = space.dim, np.random.default_rng(6)
+    x = space.samples()
     cells = local_errors(space, u, p) ** (d * p / (2 * p + d))
-    share = 0.5 / len(x) + 0.5 * cells / cells.sum()
-    chosen = rng.choice(len(x), size=PLACES, p=share)
-    chosen = chosen[np.linalg.norm(x[chosen] - np.array(space.center), axis=1).argsort()]
-    x, weight = x[chosen], space.domain.measure / (len(x) * share[chosen]) / PLACES
-    sizes = (space.domain.measure / n) ** (1 / d) * np.geomspace(0.15, 3, 36)
-    found = np.empty((len(x), len(sizes)))
+    order = (away := space.distance(x)).argsort()
+    reached = np.cumsum((0.5 / len(x) + 0.5 * cells / cells.sum())[order])
+    edges = np.interp(np.linspace(0, 1, SHELLS + 1), reached, away[order])
+    edges[0], edges[-1] = 0, np.inf
+    x = space.samples(MOST_SAMPLES)
+    shell = np.searchsorted(edges, away := space.distance(x), side="right") - 1
+    counts = np.bincount(shell, minlength=SHELLS)
+    r, volume = np.bincount(shell, away, SHELLS) / counts, space.domain.measure * counts / len(x)
+    starts = np.cumsum(counts) - counts
+    place = starts[:, None] + (rng.random((SHELLS, PLACES)) * counts[:, None]).astype(int)
+    x = x[shell.argsort(kind="stable")][place.ravel()]
+    sizes = (space.domain.measure / n) ** (1 / d) * np.geomspace(0.15, 4, 64)
+    found = np.empty((2, SHELLS, len(sizes)))
     for k, h in enumerate(sizes):
-        length = np.full(len(x), h)
-        found[:, k] = sum(simplex_errors(space, u, p, x, length, rng) for _ in range(TRIES)) / TRIES
-    # The mean over places of nearly the same r; of few simplices the least would be too small.
-    weight = weight.reshape(-1, TOGETHER)
-    found = (weight[..., None] * found.reshape(*weight.shape, -1)).sum(axis=1) / weight.sum(axis=1)[:, None]
-    weight = weight.sum(axis=1)
-    low, high = -60.0, 20.0
-    while high - low > 1e-6:
-        middle = (low + high) / 2
-        best = (found + math.exp(middle) * sizes**-d).argmin(axis=1)
-        low, high = (middle, high) if weight @ sizes[best] ** -d > n else (low, middle)
-    count = weight @ sizes[best] ** -d
-    return float(weight @ found[np.arange(len(found)), best]) ** (1 / p) * float(count / n) ** (2 / d)
+        # The same simplices for all sizes: then their number does not bias the least error.
+        error = simplex_errors(space, u, p, x, np.full(len(x), h), np.random.default_rng(7))
+        found[:, :, k] = error.reshape(SHELLS, 2, -1).mean(axis=2).T
+    return r, volume, sizes, found
+
+
+def best_profile(space: Space, u: Function, p: int, n: int, growth: float) -> tuple[np.ndarray, np.ndarray, float]:
+    """Return the sizes h(r) of `n` cells for which regular simplices at random places have the least L^p error.
+
+    Returned are r (k,), h (k,), and the error over the optimum. Neighboring sizes have a ratio of at most `growth`. h
+    minimizes the sum of volume (|error|^p + c h^-d), by dynamic programming; c follows from the number of cells. The
+    error is that of the half of the places that is not used to find h.
+    """
+    d, (r, volume, sizes, found) = space.dim, error_profile(space, u, p, n)
+    h = np.geomspace(sizes[0], sizes[-1], 400)
+    errors = np.exp(CubicSpline(np.log(sizes), np.log(found), axis=2)(np.log(h)))
+    apart = math.log(growth) * np.diff(space.along(r))
+    least = optimum(space, u, p) * (PER_CELL[d] * n) ** (-2 / d)
+
+    def sizes_for(half: np.ndarray, c: float) -> np.ndarray:
+        local = volume[:, None] * (half + c * h**-d)
+        total = [local[0]]
+        for k in range(1, len(r)):
+            inner = np.where(np.abs(h[:, None] - h) <= apart[k - 1], total[-1], np.inf).min(axis=1)
+            ends = [np.interp(h + side * apart[k - 1], h, total[-1]) for side in (-1, 1)]
+            total.append(local[k] + np.minimum.reduce([inner, *ends]))
+        chosen = [h[total[-1].argmin()]]
+        for k in range(len(r) - 2, -1, -1):
+            near = np.append(h, np.clip([chosen[-1] - apart[k], chosen[-1] + apart[k]], h[0], h[-1]))
+            near = near[np.abs(near - chosen[-1]) <= apart[k] * (1 + 1e-9)]
+            chosen.append(near[np.interp(near, h, total[k]).argmin()])
+        return np.array(chosen[::-1])
+
+    over = []
+    for half, other in (errors, errors[::-1]):
+        low, high = -60.0, 20.0
+        while high - low > 1e-4:
+            middle = (low + high) / 2
+            best = sizes_for(half, math.exp(middle))
+            low, high = (middle, high) if volume @ best**-d > n else (low, middle)
+        error = volume @ [np.interp(b, h, row) for b, row in zip(best, other, strict=True)]
+        over.append(error ** (1 / p) * (volume @ best**-d / n) ** (2 / d) / least)
+    return r, best, float(np.mean(over))
 
 
 def ideal_error(space: Space, mesh: clvoro.Diagram, u: Function, p: int) -> float:
@@ -393,7 +442,7 @@ def main(arguments: list[str] | None = None) -> int:
                         even = optimum(space, u, p) * (PER_CELL[space.dim] * len(mesh)) ** (-2 / space.dim)
                         row[f"sizes{p}"] = ideal_error(space, mesh.diagram, u, p) / even
                         if function != "smooth":  # which is no function of r
-                            row[f"bound{p}"] = best_error(space, u, p, len(mesh)) / even
+                            row[f"bound{p}"] = best_profile(space, u, p, len(mesh), options.growth)[2]
                         missed |= errors[p] / least > TARGET[space.dim]
             if name == "plane":
                 drawn.append((function, mesh))
