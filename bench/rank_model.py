@@ -18,8 +18,8 @@ Nothing is measured here. Assumptions, each of them an option:
 
 The search for ghosts on the hosts is not counted; `bench/parallel.py` has it in `CPU s`.
 
-`efficiency` is the time that one device takes for the mean number of cells, divided by the time of the step. Labels
-have 32 bits. More than 2e9 cells need longer labels, which the model does not count.
+`efficiency` is the time that one device takes for the mean number of cells, divided by the time of the step. Limits
+of clvoro are not counted: labels have 32 bits, so that all ranks have at most 2e9 cells, and a rank holds at most 1e8.
 """
 
 from __future__ import annotations
