@@ -162,6 +162,9 @@ class ProjectedMethod(Method):
     power: int = 2
     """`quality_scale`, `log_ratio_scale`, `power`: float, float, int. Scales and power of the penalty; see
     `Penalty`."""
+    scale_per_error: float = 0.0
+    """The scale s of log(L / h) is at least this times its mean magnitude, less 3 s. With a small scale the projection
+    is stiff at cells that cannot meet their sizes, as in thin parts, and spoils the shapes beside them."""
     iterations: int = 30
     tolerance: float = 1e-2
     """`iterations`, `tolerance`: int, float. Limits of each projection. Each one starts from the last solution, and
@@ -211,6 +214,9 @@ class ProjectedMethod(Method):
             if self.careful:
                 beyond = mesh.mean_log_ratio_error(w) - MET_ERROR
                 penalty = max(penalty, EXACT_PENALTY_PER_ERROR * beyond)
+            scale = self.log_ratio_scale
+            if self.scale_per_error and mesh.knows_log_ratio:
+                scale = max(scale, self.scale_per_error * mesh.mean_log_ratio_error(w) - 3 * scale)
             if self.gradient_from_field:
                 sizes = engine.scratch(mesh.n)
                 mesh.sizing.evaluate_with_gradient(mesh.points, mesh.n, sizes, gradient)
@@ -243,7 +249,7 @@ class ProjectedMethod(Method):
             Targets(mesh.local_length, gradient, log_ratio, mesh.quality, sums),
             lloyd,
             correction,
-            Penalty(penalty, self.quality_scale, self.log_ratio_scale, at_walls, self.power, most),
+            Penalty(penalty, self.quality_scale, scale, at_walls, self.power, most),
             Limits(self.tolerance, self.iterations),
             labels=mesh.labels,
             fixed=mesh.fixed,

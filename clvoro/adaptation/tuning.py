@@ -108,8 +108,9 @@ SINGLE_LEVEL_QUALITY_SCALE = 0.15
 """Smallest quality scale of polishing with one level."""
 POLISH_MOMENTUM_3D, POLISH_RATE_3D = 0.5, 0.055
 """Share of the last displacement, and step length, of polishing in 3D, where the weight of cells is about 7.5."""
-LOOSE_POLISH_3D, SETTLE_PENALTY_3D = 2.0, 0.7
-"""Error target of polishing in 3D over that of the run; penalty of the one projection that then meets the latter."""
+LOOSE_POLISH_3D, SETTLE_PENALTY_3D, SCALE_PER_ERROR_3D = 2.0, 0.7, 12.0
+"""Error target of polishing in 3D over that of the run; penalty of the one projection that then meets the latter; scale
+of log(L / h) over its mean magnitude, where that is large."""
 PENALTY_PER_ERROR = 750.0
 """Largest penalty over the error target, for targets above 0.004. The smallest penalty is 1e-3, or a smaller target."""
 AT_WALLS, AT_WALLS_OF_BOXES = 2.0, 10.0

@@ -76,6 +76,7 @@ from ..tuning import (
     POLISH_RATE_3D,
     POLISH_TOLERANCE,
     PROJECT_STEPS,
+    SCALE_PER_ERROR_3D,
     SEPARATE_PENALTY,
     SETTLE_PENALTY_3D,
     SETTLING_STEPS,
@@ -373,6 +374,7 @@ def _polish_3d(effort: Effort, penalty: float, tolerance: float, error_target: f
         bad_cell_weight=effort.bad_cell_weight,
         error_target=LOOSE_POLISH_3D * error_target,
         log_ratio_scale=effort.log_ratio_scale * error_target,
+        scale_per_error=SCALE_PER_ERROR_3D,
     )
 
 
@@ -394,6 +396,7 @@ def _finish_3d(effort: Effort, exact: bool, error_target: float, penalty: float)
             settle,
             penalty=NEWTON_PENALTY,
             log_ratio_scale=0.0,
+            scale_per_error=0.0,
             iterations=NEWTON_ITERATIONS_3D,
             gradient_from_field=True,
             correct_mean=True,
