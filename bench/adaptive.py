@@ -1,7 +1,7 @@
 """Meshes that follow a function: interpolation error against the isotropic optimum, beside Gmsh and MMG.
 
     python bench/adaptive.py [--spaces plane,space,sphere] [--functions smooth,layer,kink,shock] [--cells 4000]
-                             [--cycles 4] [--growth 1.4] [--effort fast] [--exact] [--norms 1,2] [--peers ""]
+                             [--cycles 4] [--growth 2] [--effort fast] [--norms 1,2] [--peers ""]
                              [--pictures FOLDER] [--device NAME] [--json]
 
 Each mesh begins uniform. A cycle evaluates the function at the centroids of the cells, takes sizes from
@@ -24,9 +24,7 @@ Three more columns say how much of this is due to sizes and how much to shapes. 
 all simplices were regular, with the volumes of the mesh's cells, at random places in them. L1 and L2, divided by
 "sizes", are the factors due to shapes. "bound" is the least value of "sizes" for this number of cells and this
 growth, with sizes that depend on the distance from the layer alone. It is above 1 where cells are larger than the
-layer, since the optimum holds for many cells. A mesh whose cells are not at random places can be better. With `--exact`
-the sizes come from the function's own second derivatives, averaged over a ball of the size of a cell: the difference is
-what the estimate costs.
+layer, since the optimum holds for many cells. A mesh whose cells are not at random places can be better.
 """
 
 from __future__ import annotations
@@ -48,7 +46,6 @@ from scipy.stats import qmc
 
 import clvoro
 from clvoro import sizing
-from clvoro.sizing.estimates import estimate
 from clvoro.sizing.graded import default_engine
 
 Function = Callable[[np.ndarray], np.ndarray]
@@ -162,11 +159,11 @@ class Space:
                 hessian[:, a, b] = hessian[:, b, a] = total / (4 * step**2)
         return np.linalg.eigvalsh(hessian)
 
-    def around(self, mesh: clvoro.Diagram, rng: np.random.Generator, reach: float) -> np.ndarray:
-        """Return a random vector (n, d) for each cell, in a ball of radius `reach` times the size of the cell."""
+    def around(self, mesh: clvoro.Diagram, rng: np.random.Generator) -> np.ndarray:
+        """Return a random vector (n, d) for each cell, in a ball of its volume."""
         away = rng.normal(size=(len(mesh), self.dim))
         away *= (rng.random(len(mesh)) ** (1 / self.dim) / np.linalg.norm(away, axis=1))[:, None]
-        return reach * mesh.volumes[:, None] ** (1 / self.dim) * away
+        return BALL[self.dim] * mesh.volumes[:, None] ** (1 / self.dim) * away
 
 
 SPACES = {
@@ -295,7 +292,7 @@ def best_profile(space: Space, u: Function, p: int, n: int, growth: float) -> tu
     """
     d, (r, volume, sizes, found) = space.dim, error_profile(space, u, p, n)
     h = np.geomspace(sizes[0], sizes[-1], 400)
-    errors = np.exp(CubicSpline(np.log(sizes), np.log(found), axis=2)(np.log(h)))
+    errors = np.exp(CubicSpline(np.log(sizes), np.log(np.maximum(found, 1e-60)), axis=2)(np.log(h)))
     apart = math.log(growth) * np.diff(space.along(r))
     least = optimum(space, u, p) * (PER_CELL[d] * n) ** (-2 / d)
 
@@ -330,20 +327,9 @@ def ideal_error(space: Space, mesh: clvoro.Diagram, u: Function, p: int) -> floa
     rng, length = np.random.default_rng(4), mesh.volumes ** (1 / space.dim)
     along, total = space.directions(mesh.centroids), np.zeros(len(mesh))
     for _ in range(ROUNDS):
-        away = np.einsum("nd,ndD->nD", space.around(mesh, rng, BALL[space.dim]), along)
+        away = np.einsum("nd,ndD->nD", space.around(mesh, rng), along)
         total += simplex_errors(space, u, p, space.onto(mesh.centroids + away), length, rng)
     return float(mesh.volumes @ total / ROUNDS) ** (1 / p)
-
-
-def exact_size(space: Space, u: Function, mesh: clvoro.Diagram, p: int, n: int, growth: float) -> sizing.Estimate:
-    """Return `hessian_size` with the function's own second derivatives, averaged around each cell."""
-    rng, along = np.random.default_rng(5), space.directions(mesh.centroids)
-    bent = np.zeros(len(mesh))
-    for _ in range(ROUNDS):
-        away = np.einsum("nd,ndD->nD", space.around(mesh, rng, 1.0), along)
-        bent += np.abs(space.bends(u, space.onto(mesh.centroids + away))).max(axis=1) / ROUNDS
-    bounds = {"n_cells": n, "eps": None, "h_min": 0.0, "h_max": math.inf}
-    return estimate("exact_size", mesh, bent, order=2, p=p, constant=1 / 8, growth=growth, **bounds)
 
 
 def adapt(
@@ -356,10 +342,8 @@ def adapt(
     mesh = adapter.run(space.domain, coarse, options.effort, n_cells=n // 4, seed=FIRST_SEED)
     for cycle in range(options.cycles):
         count = n // 4 if 2 * (cycle + 1) <= options.cycles else n
-        if options.exact:
-            size = exact_size(space, u, mesh.diagram, p, count, options.growth)
-        else:
-            size = sizing.hessian_size(u(mesh.centroids), on=mesh, n_cells=count, p=p, growth=options.growth)
+        bounds = {"growth": options.growth, "h_max": 0.5 if space.is_sphere else math.inf}
+        size = sizing.hessian_size(u(mesh.centroids), on=mesh, n_cells=count, p=p, **bounds)
         mesh = adapter.run(space.domain, size, options.effort, n_cells=count, points=mesh.points, seed=FIRST_SEED)
     return mesh, size, uniform
 
@@ -403,9 +387,8 @@ def main(arguments: list[str] | None = None) -> int:
     made.add_argument("--functions", default=",".join(FUNCTIONS))
     made.add_argument("--cells", type=int, default=4000)
     made.add_argument("--cycles", type=int, default=4)
-    made.add_argument("--growth", type=float, default=1.4)
+    made.add_argument("--growth", type=float, default=2.0)
     made.add_argument("--effort", default="fast", choices=("fast", "default", "best"))
-    made.add_argument("--exact", action="store_true")
     made.add_argument("--norms", default="1,2")
     made.add_argument("--peers", default=",".join(MESHERS))
     made.add_argument("--pictures", type=Path, metavar="FOLDER")

@@ -1,12 +1,14 @@
 /* Gradients and Hessians of cell data on the neighbor graph, by weighted least squares. One work-item per cell.
 
-   u(c_i + v) = u_i + g . v + v . H v / 2 is fitted to the means u_j of the neighbors and of their neighbors, with the
-   weights 1 / |v|^2 for each path of one or two faces to a cell: a cell that several paths reach counts several times.
-   It is exact for quadratic functions, at walls too. On a sphere v is the arc from c_i, in the plane that touches the
-   sphere there. */
+   u(c_i + v) = u_i + g . v + v . H v / 2 is fitted to the means u_j of the neighbors and of their neighbors. A path to
+   a cell has the weight 1 / |v|^4 if it crosses one face, SECOND_RING / |v|^4 if it crosses two: a cell that several
+   paths reach counts several times. The second ring decides little, so that a layer of few cells is not smeared, but
+   enough where a cell has few neighbors. The fit is exact for quadratic functions, at walls too. On a sphere v is the
+   arc from c_i, in the plane that touches the sphere there. */
 #include "opencl/real.h"
 
 #define TERMS (CELL_DIM + CELL_DIM * (CELL_DIM + 1) / 2)
+#define SECOND_RING R(0.03)
 #define PACKED(row, column) ((row) * ((row) + 1) / 2 + (column))
 #ifndef SMALLEST_PIVOT
 #error "build with -DSMALLEST_PIVOT=share of a pivot that counts as zero"
@@ -56,7 +58,7 @@ inline REAL find_terms(const REAL *v, const REAL *basis, REAL unit, REAL radius,
     for (int a = 0; a < CELL_DIM; ++a)
         for (int b = 0; b <= a; ++b)
             terms[t++] = terms[a] * terms[b] * (a == b ? R(0.5) : R(1));
-    return 1 / length2;
+    return 1 / (length2 * length2);
 }
 
 /* Add w terms terms^T to the packed lower triangle of `normal`. */
@@ -139,7 +141,7 @@ kernel void fit_quadratics(const int size, global const int *starts, global cons
                 REAL v[DIM];
                 for (int a = 0; a < DIM; ++a)
                     v[a] = across[k * DIM + a] + (first ? 0 : across[l * DIM + a]);
-                const REAL weight = find_terms(v, basis, unit, radius, terms);
+                const REAL weight = find_terms(v, basis, unit, radius, terms) * (first ? R(1) : SECOND_RING);
                 if (column < 0) {
                     add_to_matrix(weight, terms, matrix);
                 } else {

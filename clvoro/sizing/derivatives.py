@@ -119,10 +119,10 @@ class CellStencils:
 def derivatives(values: ArrayLike, on: Result | Diagram) -> tuple[np.ndarray, np.ndarray]:
     """Return the gradients and the Hessians of cell data.
 
-    A quadratic function is fitted to each cell, its neighbors and their neighbors, by weighted least squares on the
-    device. It is exact for quadratic functions, in cells at walls, too. On smooth data gradients are of second order,
-    and Hessians of first order, or better where the mesh is regular. Across a jump both are at most about that of the
-    jump over one cell.
+    A quadratic function is fitted to each cell, its neighbors and, with little weight, their neighbors, by weighted
+    least squares on the device. It is exact for quadratic functions, in cells at walls, too. On smooth data gradients
+    are of second order, and Hessians of first order, or better where the mesh is regular. Across a jump both are at
+    most about that of the jump over one cell.
 
     Parameters
     ----------

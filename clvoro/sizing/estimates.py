@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from functools import partial
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -23,8 +22,8 @@ if TYPE_CHECKING:
     from ..mesh.diagram import Diagram
     from ..mesh.results import Result
 
-_SMOOTHED = 2
-"""Passes over curvatures: second derivatives of computed fields are noisy, and change their sign within a layer."""
+SMOOTHED = 2
+"""Passes over the sizes from second derivatives, which are noisy, and change their sign within a layer."""
 
 
 class Estimate(OnCells):
@@ -77,8 +76,7 @@ class Estimate(OnCells):
 def curvature_of(values: object, on: Result | Diagram, p: float, weight: ArrayLike | None) -> np.ndarray:
     """Return the largest absolute eigenvalue of the Hessian in each cell, (n,), of one or several fields.
 
-    It is a mean over a cell, its neighbors and theirs. Several are scaled so that for each the integral of
-    l^(p d / (2 p + d)) is 1.
+    Several are scaled so that for each the integral of l^(p d / (2 p + d)) is 1.
     """
     check_p("hessian_size", p)
     stencils = CellStencils.of(on)
@@ -87,9 +85,7 @@ def curvature_of(values: object, on: Result | Diagram, p: float, weight: ArrayLi
     fields, found = _fields(values, len(stencils)), []
     for field in fields:
         spectral = np.abs(np.linalg.eigvalsh(derivatives(field, stencils.mesh)[1])).max(axis=-1)
-        spectral = _lengths(spectral.reshape(len(field), -1))
-        # After the absolute value: before it both sides of a layer would cancel.
-        found.append(_free_of_rounding(stencils.smooth(spectral, _SMOOTHED), field, stencils, 2))
+        found.append(_free_of_rounding(_lengths(spectral.reshape(len(field), -1)), field, stencils, 2))
     if len(fields) > 1:
         found = [_scaled(curvature, stencils.mesh.volumes, power) for curvature in found]
     most = np.maximum.reduce(found)
@@ -221,22 +217,28 @@ def estimate(
     p: float = math.inf,
     constant: float = 1.0,
     growth: float,
+    smoothed: int = 0,
     **bounds: Any,
 ) -> Estimate:
     """Return the sizes for which the error constant * indicator * h^order is least in L^p, with that error.
 
-    The sizes are those of `best_sizes`, which also takes the `bounds`: `n_cells`, `eps`, `h_min` and `h_max`.
+    The sizes are those of `best_sizes`, which also takes the `bounds`: `n_cells`, `eps`, `h_min` and `h_max`. They are
+    smoothed by as many passes: after their growth is limited, so that a peak of the indicator stays as narrow as it is.
     """
     slope = check_slope(what, growth, None)
     stencils = CellStencils.of(on)
-    places = _places(stencils, slope)
+    places = _places(stencils, slope, smoothed)
     sizes = best_sizes(what, indicator, places, order=order, p=p, constant=constant, **bounds)
     return Estimate(stencils.mesh, sizes, constant * indicator * sizes**order, order, p)
 
 
-def _places(stencils: CellStencils, slope: float) -> Places:
+def _places(stencils: CellStencils, slope: float, smoothed: int = 0) -> Places:
     domain = stencils.mesh.domain
-    limit = partial(stencils.limit_growth, slope=slope)
+
+    def limit(sizes: np.ndarray) -> np.ndarray:
+        limited = stencils.limit_growth(sizes, slope)
+        return np.exp(stencils.smooth(np.log(limited), smoothed)) if smoothed else limited
+
     return Places(stencils.mesh.volumes, domain.cell_dim, float(domain.extent.max()), limit)
 
 

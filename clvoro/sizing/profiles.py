@@ -64,7 +64,7 @@ class Places(NamedTuple):
     longest: float
     """The largest size."""
     limit: Callable[[np.ndarray], np.ndarray] | None = None
-    """Limits the growth of sizes. It makes none larger."""
+    """Limits the growth of sizes, and may smooth them. It increases with the sizes."""
 
 
 def best_sizes(
@@ -134,7 +134,7 @@ def scale_profile(
             return np.clip(np.where(np.isinf(profile), math.inf, factor * profile), h_min, top)
 
     def limited(factor: float) -> np.ndarray:
-        return sizes(factor) if limit is None else limit(sizes(factor))
+        return sizes(factor) if limit is None else np.clip(limit(sizes(factor)), h_min, top)
 
     if factor is not None:
         return limited(factor)
@@ -154,8 +154,10 @@ def scale_profile(
         begin, end = (middle, end) if count(middle) > n_cells else (begin, middle)  # type: ignore[operator]
     if limit is None:
         return sizes(math.exp(0.5 * (begin + end)))
-    # Limited sizes are smaller, so that the factor is larger.
+    # Limited sizes are smaller, so that the factor is larger; smoothed ones may be larger.
     step = _FIRST_STEP
+    while count(begin, limited) < n_cells:  # type: ignore[operator]
+        begin, end, step = begin - step, begin, 2 * step
     while count(end, limited) > n_cells and end < math.log(top) + 1e3:  # type: ignore[operator]
         begin, end, step = end, end + step, 2 * step
     while end - begin > _CLOSE:

