@@ -36,9 +36,8 @@ def narrow_faces(faces: Faces, sizes: np.ndarray, among: np.ndarray) -> np.ndarr
 
 def rejected_at_walls(faces: Faces, judged: np.ndarray) -> np.ndarray:
     """Return which of the cells `judged` (n,) bool at walls, or beside these, OpenFOAM rejects, (k,) int."""
-    walls = at_wall(faces)
-    # Other faces are those of the diagram, whose tetrahedra are right.
-    return rejected_among(faces, judged & with_neighbors(faces, walls), walls)
+    # Other faces have the vertices of the diagram, and their tetrahedra are right.
+    return rejected_among(faces, judged & with_neighbors(faces, at_wall(faces)), touching_walls(faces))
 
 
 def rejected_among(faces: Faces, judged: np.ndarray, doubtful: np.ndarray) -> np.ndarray:
