@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from ..mesh.results import Result
 
 SMOOTHED = 2
-"""Passes over the sizes from second derivatives, which are noisy, and change their sign within a layer."""
+"""Number of passes that smooth sizes from second derivatives. These are noisy, and change their sign in a layer."""
 
 
 class Estimate(OnCells):
@@ -223,7 +223,7 @@ def estimate(
     """Return the sizes for which the error constant * indicator * h^order is least in L^p, with that error.
 
     The sizes are those of `best_sizes`, which also takes the `bounds`: `n_cells`, `eps`, `h_min` and `h_max`. They are
-    smoothed by as many passes: after their growth is limited, so that a peak of the indicator stays as narrow as it is.
+    smoothed in `smoothed` passes after their growth is limited, so that a peak of the indicator stays narrow.
     """
     slope = check_slope(what, growth, None)
     stencils = CellStencils.of(on)
@@ -239,7 +239,8 @@ def _places(stencils: CellStencils, slope: float, smoothed: int = 0) -> Places:
         limited = stencils.limit_growth(sizes, slope)
         return np.exp(stencils.smooth(np.log(limited), smoothed)) if smoothed else limited
 
-    return Places(stencils.mesh.volumes, domain.cell_dim, float(domain.extent.max()), limit)
+    longest = min(float(domain.extent.max()), domain.largest_size)
+    return Places(stencils.mesh.volumes, domain.cell_dim, longest, limit)
 
 
 def sensor_size(

@@ -104,12 +104,14 @@ def hessian_size(
     p : float
         At least 1, or `math.inf`.
     h_min, h_max : float
-        Bounds. Where the Hessian is 0, h is `h_max`, by default the longest side of the box.
+        Bounds. Where the Hessian is 0, h is `h_max`, by default the longest side of the box, or the radius of
+        the sphere.
     at, missing
         As for `Raster`, of rasters only.
     growth : float
-        On a mesh only: ratio of the sizes of neighboring cells at most. `n_cells` and `eps` hold after it. Around a
-        raster write `Graded`.
+        On a mesh only: ratio of the sizes of neighboring cells at most. Then `hessian_size` smooths the sizes over two
+        rings of neighbors: they may grow a little faster, and their error, `Estimate.norm`, may exceed `eps`. `n_cells`
+        holds at the end. Around a raster write `Graded`.
     weight : (n,) array of float, optional
         On a mesh only: factor of the curvature in each cell. For a goal such as drag it is the `steepness` of the
         adjoint velocity, with p = 1 (Loseille, Dervieux and Alauzet 2010, J. Comput. Phys. 229, 2866); `force_weight`
@@ -225,7 +227,8 @@ def gradient_size(
     n_cells : float, optional
         In place of `eps`: number of cells in the box, bounds included.
     h_min, h_max : float
-        Bounds. Where the gradient is 0, h is `h_max`, by default the longest side of the box.
+        Bounds. Where the gradient is 0, h is `h_max`, by default the longest side of the box, or the radius of
+        the sphere.
 
     Returns
     -------

@@ -192,6 +192,13 @@ def test_both_sides_of_a_layer_count(fine):
     assert inside.max() < 1.5 * inside.min()
 
 
+def test_sizes_on_a_sphere_do_not_exceed_its_radius(meshes):
+    """Larger ones are refused by a run."""
+    mesh = meshes["sphere"]
+    made = sizing.hessian_size(np.tanh(2 * mesh.centroids[:, 2]), on=mesh, n_cells=300, growth=10)
+    assert made.values.max() == pytest.approx(mesh.domain.radius, rel=1e-6)
+
+
 def test_fields_of_other_units_count_alike(fine):
     x, y = fine.centroids.T
     u, w = np.tanh(20 * (x - 0.5)), 1e6 * np.tanh(20 * (y - 0.5))
