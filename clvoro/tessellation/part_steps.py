@@ -49,7 +49,6 @@ each ball, as a share of the ball's radius. A part also asks for generators in t
 NEAR, FREE = 1.2, 0.8
 """Largest distance between a ball and a box of another part that are compared, over the largest radius of the balls of
 both. Radius around a generator within which all others are known, over its distance from other parts."""
-EXTREMES = np.minimum, np.maximum
 NOISE = {"float64": 1e-6, "float32": 1e-4}
 """Bound of the round-off of a reach, as a share of it."""
 FILLED, MATCHED = {"float64": 1e-8, "float32": 1e-3}, {"float64": 1e-5, "float32": 1e-3}
@@ -71,7 +70,7 @@ class Chunks:
     ----------
     points : (n, d) float
     least : float
-        Least spacing.
+        Lower bound of `spacings`.
 
     Attributes
     ----------
@@ -118,7 +117,7 @@ class BallGroups:
 
     def __init__(self, centers: np.ndarray, radii: np.ndarray, chunks: Chunks) -> None:
         self.centers, self.radii, self.chunks, firsts = centers, radii.copy(), chunks, chunks.firsts
-        lower, upper = (f.reduceat(centers, firsts, axis=0) for f in EXTREMES)
+        lower, upper = (f.reduceat(centers, firsts, axis=0) for f in (np.minimum, np.maximum))
         self.largest = np.maximum.reduceat(radii, firsts)
         self.boxes = np.hstack([lower, upper])
         self.facts = np.column_stack([self.boxes, self.largest, SKIN * np.minimum.reduceat(radii, firsts)])
@@ -328,12 +327,14 @@ class PartSteps(DomainSteps):
 
     def _share_landmarks(self, x: np.ndarray) -> None:
         """Give the generators nearest to the landmarks of the domain to all parts; own ones are at `x` (n, d)."""
-        squares, places = (x * x).sum(axis=1), self.domain.place(self.domain.landmarks, self.stages.engine.real)
-        nearest = np.array([(np.inf, 0.0)] * len(places)).reshape(-1, 2)
+        places = self.domain.place(self.domain.landmarks, self.stages.engine.real)
+        if not len(places):
+            return
+        squares, nearest = (x * x).sum(axis=1), np.tile((np.inf, 0.0), (len(places), 1))
         for k, place in enumerate(places if len(x) else ()):
             ways2 = squares - 2 * (x @ place)
             nearest[k] = ways2.min(), ways2.argmin()
-        found = np.array(self.peers.gather(nearest)) if len(places) else np.empty((self.peers.count, 0, 2))
+        found = np.array(self.peers.gather(nearest))
         owners = found[:, :, 0].argmin(axis=0)
         for number in np.unique(owners):
             rows = np.unique(found[number, owners == number, 1]).astype(np.int32)
