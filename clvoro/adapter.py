@@ -547,7 +547,7 @@ class Adapter:
             kept.release()  # buffers of a diagram, or of a failed run, are not part of this run's memory
         stages = self._stages_for(arguments.domain, self._peers)
         if self._peers.shared:
-            check_shared(arguments.domain, arguments.options, arguments.fixed)
+            check_shared(arguments)
         with report_builds(stages.engine, self.on_build) as notice:
             shown = self._shown(callback, notice)
             stages.engine.pool.on_work = self.on_work

@@ -30,13 +30,15 @@ from ..sizing.field import Field
 from .estimates import check_memory, check_prisms
 
 COARSER, FINER = 2.0, 1e-3
-"""Ratios of the sizes of layers and of the field beside them that indicate a mistake."""
+"""Size of the cells of layers over the size field above which a run warns, and their default width over it below which
+it warns."""
 THICKEST, FLATTEST, THINNEST = 3.0, 1000.0, 0.02
-"""Limits of layers of prisms: all together and the first one over the size field, and the last one over it."""
+"""Limits of layers of prisms beyond which a run warns: largest thickness of all layers over the size field, largest
+size field over the height of the first layer, and least height of the last layer over the size field."""
 NARROWER = 0.8
-"""Width of layers over the size field below which a run says so."""
+"""Default width of layers over the size field below which the settings of the result say so."""
 SAMPLE = 64
-"""Points along a layer where the sizes are compared."""
+"""Largest number of points along a layer at which its sizes are compared with the size field."""
 
 
 @dataclass(frozen=True)
@@ -77,6 +79,20 @@ class Layout:
                 "points out"
             )
         return np.flatnonzero(beyond)
+
+    @property
+    def narrow_layers(self) -> str:
+        """Where the default width of layers is smaller than the size field, in words; empty if it is nowhere."""
+        found = []
+        for k, layer in enumerate(self.layers):
+            if layer.spacing is None and not self.domain.extrudes_layers:
+                h = _size_along(layer, layer.count, columns_of(self.domain, layer), self.given, self.domain)
+                if layer.width < NARROWER * h:
+                    found.append(
+                        f"layers[{k}] have cells {layer.width:.3g} wide, the last layer's height, where the size field "
+                        f"is {h:.3g}: give spacing for others"
+                    )
+        return "; ".join(found)
 
     def check_prisms(self, size: Callable[[np.ndarray], np.ndarray]) -> None:
         """Raise `MemoryLimitError` if the prisms on walls of the sizes `size` need too much memory of the host."""
@@ -135,23 +151,6 @@ def lay_out(
     return Layout(domain, layers, field, limited, rows, free)
 
 
-def widths_of_layers(field: Field, domain: Domain, layers: Sequence[Layers]) -> str:
-    """Return in words where the default width of layers is smaller than the size field, or an empty text."""
-    found = []
-    for k, layer in enumerate(layers):
-        if layer.spacing is None and not domain.extrudes_layers:
-            feet, normals = columns_of(domain, layer)
-            places = (feet + layer.rows[-1] * normals)[:: -(-len(feet) // SAMPLE)]
-            places = places[domain.contains(places)]
-            h = float(np.median(field(places))) if len(places) else 0.0
-            if layer.width < NARROWER * h:
-                found.append(
-                    f"layers[{k}] have cells {layer.width:.3g} wide, the last layer's height, where the size field is "
-                    f"{h:.3g}: give spacing for others"
-                )
-    return "; ".join(found)
-
-
 def layer_mismatches(name: str, layer: Layers, field: Field, domain: Domain) -> list[str]:
     """Return warnings if the cells of `layer` have a very different size than `field` there.
 
@@ -160,14 +159,9 @@ def layer_mismatches(name: str, layer: Layers, field: Field, domain: Domain) -> 
     """
     if domain.extrudes_layers:
         return _prism_mismatches(name, layer, field, domain)
-    feet, normals = columns_of(domain, layer)
-    some = slice(None, None, -(-len(feet) // SAMPLE))
+    columns = columns_of(domain, layer)
     for row in sorted({0, layer.count - 1}):
-        places = (feet + layer.rows[row] * normals)[some]
-        places = places[domain.contains(places)]
-        if not len(places):
-            continue
-        h, height = float(np.median(field(places))), float(layer.heights[row])
+        h, height = _size_along(layer, row, columns, field, domain), float(layer.heights[row])
         what = f"{name} has cells {layer.width:.3g} wide and {height:.3g} high where the size field is {h:.3g}"
         if math.sqrt(layer.width * height) > COARSER * h:
             remedy = "make the layers finer or the size field larger along these walls"
@@ -178,6 +172,14 @@ def layer_mismatches(name: str, layer: Layers, field: Field, domain: Domain) -> 
                 "field have the same unit? Otherwise give spacing, the width along the wall"
             ]
     return []
+
+
+def _size_along(layer: Layers, row: int, columns: tuple[np.ndarray, np.ndarray], field: Field, domain: Domain) -> float:
+    """Return the median of `field` along row `row` of `layer`, at its `columns`; nan if it is outside of the domain."""
+    feet, normals = columns
+    places = (feet + layer.rows[row] * normals)[:: -(-len(feet) // SAMPLE)]
+    places = places[domain.contains(places)]
+    return float(np.median(field(places))) if len(places) else math.nan
 
 
 def _prism_mismatches(name: str, layer: Layers, field: Field, domain: Domain) -> list[str]:

@@ -38,7 +38,7 @@ _APART = 0.7
 
 
 class CellCount(NamedTuple):
-    """How many cells a run makes."""
+    """Number of cells of a run, and what it follows from."""
 
     tree: DensityTree | None
     """Number of cells in each part of the domain; None if the method keeps the number of given points."""
@@ -47,7 +47,7 @@ class CellCount(NamedTuple):
     target: int
     """Number of cells of the finest level."""
     factor: float
-    """Factor on the size field with which it requires as many."""
+    """Factor on the size field with which it requires `target` cells."""
 
 
 @dataclass(frozen=True)
@@ -58,8 +58,7 @@ class Prepared:
     setup: Setup
     points: np.ndarray | None
     """(n, d) ndarray or None. Points of the caller, or some of them, then new ones (`without_far`)."""
-    rows: np.ndarray
-    """(m, d) ndarray. Generators of layers, which do not move."""
+    layout: Layout
     count: CellCount
     lattice: np.ndarray | None
     """(n, d) ndarray or None. Generators at the start of a moving mesh."""
@@ -77,7 +76,7 @@ class Prepared:
         if self.points is None:
             return None
         own = np.arange(len(self.points)) if self.kept_rows is None else self.kept_rows
-        return np.concatenate([np.full(len(self.rows), -1), own]).astype(np.int32)
+        return np.concatenate([np.full(len(self.layout.rows), -1), own]).astype(np.int32)
 
 
 class Beginning(NamedTuple):
@@ -129,7 +128,7 @@ def prepare(stages: Stages, arguments: RunArguments, max_levels: int | None = No
     most = max(count.target, 0 if points is None else len(points))
     layout.check_prisms(lambda x: count.factor * sizing(x))
     memory = _estimate_memory(setup, options, count, most, levels)
-    return Prepared(options, setup, points, layout.rows, count, lattice, levels, kept_rows, memory)
+    return Prepared(options, setup, points, layout, count, lattice, levels, kept_rows, memory)
 
 
 def _set_up(
@@ -337,7 +336,7 @@ def _is_narrow(setup: Setup, coarseness: float) -> bool:
 
 def start(prepared: Prepared) -> MeshState:
     """Return the mesh of the initial generators: those of layers, then those of the caller or a random sample."""
-    setup, rows, levels = prepared.setup, prepared.rows, prepared.levels
+    setup, rows, levels = prepared.setup, prepared.layout.rows, prepared.levels
     domain, engine, fixed = setup.domain, setup.stages.engine, setup.points
     host = prepared.points if prepared.lattice is None else prepared.lattice
     if host is None:
@@ -372,8 +371,9 @@ def _sample(prepared: Prepared) -> np.ndarray:
 
 def _cells_at_start(prepared: Prepared) -> int:
     """Return the number of cells of the coarsest level, without those of layers."""
-    cells = (prepared.count.target - len(prepared.rows)) / 2 ** (prepared.setup.domain.cell_dim * prepared.levels)
-    return max(prepared.setup.free.least_cells(prepared.levels > 0), round(cells))
+    layout, levels = prepared.layout, prepared.levels
+    cells = (prepared.count.target - len(layout.rows)) / 2 ** (layout.domain.cell_dim * levels)
+    return max(layout.free.least_cells(levels > 0), round(cells))
 
 
 def without_far(prepared: Prepared, max_levels: int | None = None) -> Prepared:
@@ -392,7 +392,7 @@ def without_far(prepared: Prepared, max_levels: int | None = None) -> Prepared:
     if len(rows):
         new = np.full(len(points) - len(rows), -1)
         return replace(prepared, points=points, kept_rows=np.concatenate([before[rows], new]))
-    levels = _count_levels(setup, None, prepared.count.target, len(prepared.rows), options)
+    levels = _count_levels(setup, None, prepared.count.target, len(prepared.layout.rows), options)
     levels = levels if max_levels is None else min(levels, max_levels)
     # Points are drawn for the coarsest level from the tree as it was.
     tree = density_tree(setup.sizing, setup.free)

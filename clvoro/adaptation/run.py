@@ -14,14 +14,12 @@ import numpy as np
 
 from ..arguments import check_points
 from ..errors import InputError, InputTypeError, Interrupted
-from ..geometry.domain import Domain
 from ..mesh.diagram import Diagram
 from ..mesh.results import HISTORY_DTYPE, Displacements, Result, figures
 from ..mesh.straightening import cell_quality
 from ..mesh.subset import without_holes
 from ..opencl.prebuild import renew
 from ..opencl.primitives import Summary
-from ..sizing.field import as_field
 from ..solvers.linear_system import Solution
 from ..tessellation.periodic.images import FewCellsError
 from ..tessellation.readback.parts import CellRows
@@ -29,10 +27,9 @@ from .checkpoint import Checkpointer, Saved, progress_of, run_fingerprint, take_
 from .diagnostics import MISSED, warn_of_errors, warn_of_moved_points, warn_of_obtuse_triangles, warn_of_other_sizes
 from .fixed_points import origins, put_back
 from .gathering import ResultParts
-from .layers import widths_of_layers
 from .methods import MOVING
 from .motion import Displacement, Method
-from .options import Options, RunArguments, uses
+from .options import RunArguments, uses
 from .plan.actions import CorrectCount, Refine, Step
 from .plan.efforts import EFFORTS
 from .plan.schedule import work_of
@@ -48,9 +45,9 @@ SETTLED = "tolerance of the moving mesh met"
 """Reasons of converged runs."""
 
 
-def check_shared(domain: Domain, options: Options, fixed: object) -> None:
+def check_shared(arguments: RunArguments) -> None:
     """Raise if ranks or devices cannot share such a run."""
-    what = ""
+    (domain, _, options, _, fixed, _), what = arguments, ""
     if not domain.may_have_parts:
         what = f"domain is {domain!r:.80}, expected a Sphere, or a Box without lines, holes or surfaces inside"
     elif options.method in ("transport", *MOVING):
@@ -154,8 +151,7 @@ class Run:
                     beginning, after = judge_points(prepared, self.state)
                     if after is not prepared:
                         stages.release()
-                        prepared = after
-                        self.target, self.levels = float(prepared.count.target), prepared.levels
+                        prepared, self.levels = after, after.levels
                         self.state = start(prepared)
             except FewCellsError as error:
                 self._begin(arguments, self._fewer_levels(error), beginning=beginning)
@@ -172,7 +168,7 @@ class Run:
         if saved is not None and not peers.rests:
             self.state = saved.mesh(prepared.setup, planned.schedule)
         self._set_out(prepared, planned, saved)
-        self._settings = self._describe(planned)
+        self._settings = self._describe(prepared, planned)
 
     def _set_out(self, prepared: Prepared, planned: Plan, saved: Saved | None) -> None:
         """Set how far the run has come: it begins, or it goes on where it was saved."""
@@ -199,7 +195,7 @@ class Run:
         steps = [position for position, action in enumerate(self.schedule) if isinstance(action, Step)]
         self._last_step = steps[-1] if steps and self._tol is None else None
 
-    def _describe(self, planned: Plan) -> dict[str, Any]:
+    def _describe(self, prepared: Prepared, planned: Plan) -> dict[str, Any]:
         """Return the settings for the result: those that the method uses."""
         options = self._options
         settings = {
@@ -212,9 +208,7 @@ class Run:
             "fixed": len(self.arguments.fixed),
         }
         used = {name: value for name, value in settings.items() if uses(options.method, name)}
-        size = as_field(self.arguments.size)
-        widths = widths_of_layers(size, self._domain, options.layers) if options.layers else ""
-        used |= {"widths": widths} if widths else {}
+        used |= {"widths": widths} if (widths := prepared.layout.narrow_layers) else {}
         used |= {"path": self.beginning.why} if self.beginning.why else {}
         return {**used, "trade": planned.trade} if options.multilevel else used
 
@@ -233,13 +227,13 @@ class Run:
         return size if level == 0 else min(max(int(cells / PART_CELLS), 1), size)
 
     def call_parts(self, mesh: dict[str, Any]) -> None:
-        """Let as many parts work as the next finer level has work for; its mesh is made with the arguments `mesh`."""
+        """Call further parts to the next finer level, if it has work for them; `mesh` are arguments of its mesh."""
         peers = self._stages.engine.peers
         count = self._parts_on(self.level - 1)
         if count > peers.count:
             state = {name: getattr(self, name) for name in ("begun", "_renewed", "labeled", "_stop", "stop_reason")}
             peers.call(count, (mesh, progress_of(self), np.concatenate(self.rows), state))
-            vars(self._stages).pop("poisson", None)  # other kernels
+            vars(self._stages).pop("poisson", None)  # over another number of parts it has other kernels
 
     def _join(self) -> bool:
         """Wait for work, and join a run that others have refined; return whether it goes on."""
