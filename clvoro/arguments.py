@@ -23,7 +23,7 @@ WARNING: ContextVar[Callable[[str, type[Warning]], object] | None] = ContextVar(
 
 
 def warn(message: str, category: type[Warning]) -> None:
-    """Warn at the line outside of clvoro that called one of its functions, or call `WARNING` instead."""
+    """Give a warning at the line of the user's code that called clvoro, or call `WARNING` instead."""
     if (other := WARNING.get()) is not None:
         other(message, category)
         return

@@ -44,7 +44,8 @@ if TYPE_CHECKING:
 FORMAT, PIECE, VERSION = "clvoro-checkpoint", "clvoro-checkpoint-piece", 12
 _GENERATORS = tuple(field.name for field in dataclasses.fields(Generators))
 _OTHERS = ("potential", "multipliers", "weights")
-_COUNTS = ("position", "level", "levels", "n_start", "started", "steps", "next_label", "pace")
+_PROGRESS = ("position", "level", "n_start", "started", "steps", "pace")
+_COUNTS = (*_PROGRESS, "levels", "next_label")
 
 
 class Checkpointer:
@@ -159,7 +160,7 @@ class Saved:
     levels : int
         Number of coarser levels of the run.
     parts : int
-        Number of parts that work on this level.
+        Number of parts that work on the saved level.
     beginning : Beginning
         What the run began with.
 
@@ -355,16 +356,16 @@ class Saved:
 
 def progress_of(run: Run) -> dict[str, Any]:
     """Return plain values that say how far `run` has come in its schedule."""
-    found = {name: getattr(run, name) for name in ("position", "level", "n_start", "started", "steps", "pace")}
+    found = {name: getattr(run, name) for name in _PROGRESS}
     return found | {"methods": [_state_of(method) for method in _methods_of(run.schedule)]}
 
 
 def take_progress(run: Run, found: dict[str, Any], history: np.ndarray) -> None:
-    """Let `run` have come as far as the one of `progress_of`, with this `history`."""
+    """Give `run` the progress of another, which `progress_of` has `found`, and its `history`."""
     for method, values in zip(_methods_of(run.schedule), found["methods"], strict=True):
         for name in _state_of(method):
             setattr(method, name, values[name])
-    for name in ("level", "n_start", "started", "position", "steps", "pace"):
+    for name in _PROGRESS:
         setattr(run, name, found[name])
     steps = [action for action in run.schedule[: run.position] if isinstance(action, Step)]
     run.last = steps[-1].method if steps else None

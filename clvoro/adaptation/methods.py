@@ -163,8 +163,9 @@ class ProjectedMethod(Method):
     """`quality_scale`, `log_ratio_scale`, `power`: float, float, int. Scales and power of the penalty; see
     `Penalty`."""
     scale_per_error: float = 0.0
-    """The scale s of log(L / h) is at least this times its mean magnitude, less 3 s. With a small scale the projection
-    is stiff at cells that cannot meet their sizes, as in thin parts, and spoils the shapes beside them."""
+    """The scale of log(L / h) is the larger one of `log_ratio_scale` and of this times the mean |log(L / h)|, less 3
+    `log_ratio_scale`. A small scale forces sizes on cells that cannot have them, as in thin parts, and spoils the
+    shapes beside them."""
     iterations: int = 30
     tolerance: float = 1e-2
     """`iterations`, `tolerance`: int, float. Limits of each projection. Each one starts from the last solution, and

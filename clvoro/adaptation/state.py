@@ -115,7 +115,7 @@ class Setup:
 
     @property
     def first_sized(self) -> int:
-        """Label of the first generator whose cell keeps its size: that is its target size."""
+        """Label of the first generator whose target size is the size of its cell, whatever the size field is."""
         return len(self.points) - (0 if self.around is None else self.around.n_sized)
 
     @property

@@ -65,8 +65,8 @@ POLISH_COUNT_3D, POLISH_GROWTH_3D = 5e-3, 1.016
 SAMPLING_GAIN = 0.26
 """Factor on the error of the number of cells, by sizes at the generators, from one level to the next finer one."""
 LEAST_PROGRESS, MAX_OSCILLATIONS = 0.9, 2
-"""Corrections of the number of cells end after `MAX_OSCILLATIONS` changes of sign, unless they have fallen to the share
-`LEAST_PROGRESS` of earlier ones."""
+"""Corrections of the number of cells end after `MAX_OSCILLATIONS` changes from too many cells to too few or back, which
+start again from zero when the error falls below `LEAST_PROGRESS` times the smallest one before."""
 CLIMB_STRAIN = 0.06
 """Strain across a dislocation (a 5-sided and a 7-sided cell) above which it climbs."""
 WALL_STRAIN = 0.3

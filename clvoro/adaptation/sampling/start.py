@@ -180,7 +180,7 @@ def replace_far(
 
 
 def _are_far(expected: np.ndarray, given: np.ndarray, dim: int) -> np.ndarray:
-    """Return for each box, (m,) bool, whether the number of points in its stretch is far from the expected one.
+    """Return for each box, (m,) bool, whether its stretch has far more or far fewer points than expected.
 
     `expected` and `given` (m,) are numbers of points in each box, in the order of the curve.
     """
