@@ -41,7 +41,8 @@ def main() -> None:
         "cells": lambda r: f"{r['cells']:,}",
         "images": lambda r: f"{r['images']:.2f}",
     }
-    for name in ("cold", "warm", "whole", *(["run"] if options.runs else [])):
+    parts = ["cold", "warm", "whole", *(["run"] if options.runs else [])]
+    for name in parts:
         columns[f"{name}: box, domain, ratio"] = lambda r, name=name: (
             f"{r['box'][name]:.2f}, {r['domain'][name]:.2f}, {r['domain'][name] / r['box'][name]:.2f}"
         )
@@ -53,19 +54,20 @@ def main() -> None:
             box = clvoro.Box((0,) * dim, (1,) * dim)
             domain = rough_lake(options.edges) if kind == "polygon" else clvoro.Box(box.lower, box.upper, (True,) * dim)
             for n in options.sizes if dim == 2 else [n // 10 for n in options.sizes]:
-                report.add({"kind": kind, "dim": dim, "cells": n, **compare(adapter, box, domain, n, options)})
+                report.add(
+                    {"kind": kind, "dim": dim, "cells": n, **compare(adapter, box, domain, n, parts, options.repeat)}
+                )
     report.finish(heading(adapter, "Domains beside boxes, microseconds per cell"))
 
 
-def compare(adapter: clvoro.Adapter, box: Any, domain: Any, n: int, options: Any) -> dict[str, Any]:
+def compare(adapter: clvoro.Adapter, box: Any, domain: Any, n: int, parts: list[str], repeat: int) -> dict[str, Any]:
     """Return microseconds per cell of each part of the work on both domains, and the ratio of images to generators."""
     works = {"box": work_on(adapter, box, n), "domain": work_on(adapter, domain, n)}
     seconds: dict[str, dict[str, float]] = {name: {} for name in works}
     folded = works["domain"]["cold"]().folded
-    for part in ("cold", "warm", "whole", *(["run"] if options.runs else [])):
-        repeat = 1 if part == "run" else options.repeat
+    for part in parts:
         taken: dict[str, list[float]] = {name: [] for name in works}
-        for _ in range(repeat + 1):
+        for _ in range(2 if part == "run" else repeat + 1):
             for name, work in works.items():
                 adapter.queue.finish()
                 began = time.process_time()

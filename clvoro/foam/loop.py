@@ -164,10 +164,10 @@ def adapt_case(
     """Adapt the mesh of a case of OpenFOAM to its latest solution, `cycles` times.
 
     A cycle reads the latest time, estimates sizes from its fields, makes a mesh with them, and transfers all fields in
-    cells. With `window` it adapts the present generators, or makes new ones where the sizes differ much. The new mesh
-    and its fields become the latest time, in place of the old one, in one step: at any moment the case has a mesh that
-    fits its fields. Fluxes `phi` are projected so that they are free of divergence. Names and types of patches and
-    boundary conditions stay; their lists of values are interpolated.
+    cells. With `window` it begins from the present generators; without, all are new. The new mesh and its fields become
+    the latest time, in place of the old one, in one step: at any moment the case has a mesh that fits its fields.
+    Fluxes `phi` are projected so that they are free of divergence. Names and types of patches and boundary conditions
+    stay; their lists of values are interpolated.
 
     With `solver` the case is solved first, between the cycles, and at the end. A call that was killed goes on where it
     was, if it is repeated.
@@ -410,8 +410,8 @@ class _Loop:
         size = self._sizes_in_window(fields, old, latest)
         layers = tuple(_layers_of(note["layers"])) if self.layers is None else self.layers
         domain = old.diagram.domain
-        # Moved generators keep their number along walls, which a steady flow notices; fields of an unsteady one lose
-        # less between meshes that are alike.
+        # Generators that move keep their number along walls, whatever the sizes are there: a steady flow gets new ones.
+        # Fields of an unsteady flow lose less in a transfer between similar meshes.
         points = old.diagram.points if self.window else None
         made = self.adapter.run(domain, size, self.effort, points=points, n_cells=self.n_cells, layers=layers)
         mesh_seconds = time.perf_counter() - start
