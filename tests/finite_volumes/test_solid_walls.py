@@ -115,6 +115,31 @@ def test_a_cell_with_a_vertex_beyond_its_other_side_is_spoiled(made):
     assert mend.spoiled_near_walls(faces, replace(faces, points=points))[cell]
 
 
+def test_an_edge_that_runs_back_is_found_between_cells_that_touch_a_wall_in_vertices(ctx):
+    """The two cells at the concave crease of an L have no wall. Tetrahedra at their common face are inverted."""
+    k = np.arange(0.5, 6)
+    x = np.stack(np.meshgrid(k, k, k, indexing="ij"), axis=-1).reshape(-1, 3)
+    faces = clvoro.Adapter(ctx).diagram(clvoro.Box((0, 0, 0), (6, 6, 6)), x).faces
+    faces = faces.part(~(faces.generators[:, :2] > 3).all(axis=1))[0]
+    judged = np.ones(faces.n_cells, bool)
+    assert not mend.rejected_at_walls(faces, judged).size
+    at_crease = scipy.spatial.KDTree(faces.generators).query([(2.5, 2.5, 2.5), (2.5, 2.5, 3.5)])[1]
+    assert not mend.at_wall(faces)[at_crease].any()
+    p, q = scipy.spatial.KDTree(faces.points).query([(2, 2, 3), (3, 2, 3)])[1]
+    n, loops = len(faces.points), np.split(faces.corners, faces.starts[1:-1])
+    for row, loop in enumerate(loops):
+        for i, edge in enumerate(zip(loop, np.roll(loop, -1), strict=True)):
+            if set(edge) == {p, q}:
+                loops[row] = np.insert(loop, i + 1, [n, n + 1] if edge == (p, q) else [n + 1, n])
+    folded = replace(
+        faces,
+        points=np.concatenate([faces.points, [(2.51, 2, 3), (2.49, 2, 3)]]),
+        corners=np.concatenate(loops),
+        starts=np.append(0, np.cumsum([len(loop) for loop in loops])),
+    )
+    assert np.isin(at_crease, mend.rejected_at_walls(folded, judged)).all()
+
+
 def test_cells_are_closed(made):
     _, faces = made
     cell, begin, end = sides_of_cells(faces)
