@@ -7,7 +7,9 @@ have faces in two directions. Throats and needles that are narrower than a cell 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -43,7 +45,7 @@ RINGS = 2
 FAR = 10
 """Number of nearest cells of which one may be cut for a rejected cell, if cuts of its neighbors do not help."""
 ROUNDS = 16
-"""How often cells that are bad are divided anew, at most."""
+"""Largest number of rounds in which bad cells are divided anew."""
 
 Side = tuple[int, int, int]
 """First and last point of a side, counter-clockwise around its cell, and the cell beyond; on a wall -1 - wall."""
@@ -150,30 +152,24 @@ class _Edit:
         """Divide `cell` and another one anew, if that helps: a neighbor, or else one of the nearest cells."""
         near = sorted({side[2] for side in self.sides_of(cell) if side[2] >= 0} - {cell})
         for most in MOST_FILLED:
-            if self._try(cell, near, True, most) or self._try(cell, near, False, most):
+            if any(self._try(cell, near, partial(self._divided, most, union)) for union in (True, False)):
                 return
-        if self._try(cell, near[:1], None):
+        if self._try(cell, near[:1], self._moved):
             return
         order = np.argsort(((self.old.generators - self.old.generators[cell]) ** 2).sum(axis=1), kind="stable")
-        self._try(cell, [c for c in order[1:FAR].tolist() if c not in near], False, MOST_FILLED[-1])
+        far = [c for c in order[1:FAR].tolist() if c not in near]
+        self._try(cell, far, partial(self._divided, MOST_FILLED[-1], False))
 
-    def _try(self, cell: int, others: list[int], union: bool | None, most: float = 0.0) -> bool:
-        """Divide a cell and one of `others` anew if fewer cells are bad then; return whether that is so.
+    def _try(self, cell: int, others: list[int], changes: Callable[[int, int, Loops], list[_Change]]) -> bool:
+        """Make the best change of a cell and one of `others` if it leaves fewer bad cells; return whether it does.
 
-        With `union` the two cells together are cut. Without it the other one alone is cut, and walls take the place of
-        `cell`. The cut taken leaves the fewest bad cells, and of such cuts the one whose worst cell is the best.
-        `most` is one of `MOST_FILLED`. With None instead of `union` corners of `cell` are moved; see `MOVED`.
+        `changes` returns those to try, given both cells and the sides of all cells around them. The best one leaves
+        the fewest bad cells, and of such changes has the best worst cell.
         """
         best: tuple[tuple[int, float], _Change] | None = None
         for other in others:
             local, judged = self._around(cell, other)
-            made = [_Change(local, {})]
-            if union is None:
-                made += [_Change(local, new) for new in self._moves(cell)]
-            else:
-                outline, walled = (self._union(cell, other), {}) if union else self._without(cell, other, local)
-                cuts = self._cuts(self._straightened(outline, most)) if len(outline) > 2 else []
-                made += [self._changed(cell, other, cut, {**local, **walled}) for cut in cuts]
+            made = [_Change(local, {}), *changes(cell, other, local)]
             (count, _), *scores = self._scores(made, judged)
             for (left, worst), change in zip(scores, made[1:], strict=True):
                 if left < count and (best is None or (left - count, worst) < best[0]):
@@ -192,18 +188,28 @@ class _Edit:
                 self.changed[c] = [(place.get(a, a), place.get(b, b), other) for a, b, other in loop]
         return True
 
-    def _moves(self, cell: int) -> list[dict[int, np.ndarray]]:
-        """Return places for all corners where `cell` is not convex, by number."""
-        loop, found = self.sides_of(cell), []
+    def _divided(self, most: float, union: bool, cell: int, other: int, local: Loops) -> list[_Change]:
+        """Return the cells `local` after each cut of the `union` of two cells, or of the other one alone.
+
+        Then walls take the place of `cell`. `most` is one of `MOST_FILLED`.
+        """
+        outline, walled = (self._union(cell, other), {}) if union else self._without(cell, other, local)
+        cuts = self._cuts(self._straightened(outline, most)) if len(outline) > 2 else []
+        return [self._changed(cell, other, cut, {**local, **walled}) for cut in cuts]
+
+    def _moved(self, cell: int, other: int, local: Loops) -> list[_Change]:
+        """Return the cells `local` with all corners moved where `cell` is not convex, once for each of `MOVED`."""
+        del other
+        loop, found = local[cell], []
         for share in MOVED:
             new: dict[int, np.ndarray] = {}
             for (a, p, _), (_, b, _) in zip(loop, [*loop[1:], loop[0]], strict=True):
                 x, y, z = (new.get(k, self.points[k]) for k in (a, p, b))
                 way = z - x
-                off = ((y - x)[0] * way[1] - (y - x)[1] * way[0]) / (way @ way)
-                if off < STRAIGHT:
-                    new[p] = y + (share - off) * np.array([way[1], -way[0]])
-            found += [new] if new else []
+                off = (y - x)[0] * way[1] - (y - x)[1] * way[0]
+                if off < STRAIGHT * (way @ way):
+                    new[p] = y + (share - off / (way @ way)) * np.array([way[1], -way[0]])
+            found += [_Change(local, new)] if new else []
         return found
 
     def _around(self, *cells: int) -> tuple[Loops, list[int]]:
@@ -287,9 +293,9 @@ class _Edit:
         return found
 
     def _cuts(self, outline: list[Side]) -> list[_Cut]:
-        """Return cuts of a polygon into two convex ones, those with the roundest halves first.
+        """Return the cuts of a polygon into two convex halves, the roundest first.
 
-        A cut ends in corners or in new points on sides. The less round half counts.
+        A cut ends in corners or in new points on sides. Its less round half counts: area over squared perimeter.
         """
         count, step = len(outline), len(SHARES) + 1
         corner = np.array([self.points[side[0]] for side in outline])
@@ -380,7 +386,7 @@ class _Edit:
 def _faces(
     old: Faces, generators: np.ndarray, points: np.ndarray, ends: np.ndarray, owner: np.ndarray, neighbor: np.ndarray
 ) -> Faces:
-    """Return a mesh from the ends (f, 2) and cells of its faces, sorted as in all meshes: inner faces first."""
+    """Return the mesh of faces with these `ends` (f, 2) and cells (f,). Inner faces come first, as in all meshes."""
     inner = neighbor >= 0
     order = np.lexsort((np.where(inner, neighbor, owner), np.where(inner, owner, -1 - neighbor), ~inner))
     return replace(
