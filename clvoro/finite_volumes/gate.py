@@ -106,9 +106,9 @@ def rejection(mesh: Faces, walls: WallShape = "straight") -> str:
     else:
         judged = cells_beyond(_MEASURES[mesh.dim](mesh))
         judged[mesh.owner[at_walls & (mesh.neighbor < 0)]] = True
-        if mesh.domain.borders is not None and mesh.domain.borders.sheets is not None:
+        if mesh.domain.sheets is not None:
             at_walls, size = True, np.cbrt(mesh.volumes)
-            judged |= mesh.domain.borders.sheets.distance(mesh.generators) < size
+            judged |= mesh.domain.sheets.distance(mesh.generators) < size
     if not judged.any():
         return ""
     kept, k = judged.copy(), np.flatnonzero(mesh.neighbor >= 0)

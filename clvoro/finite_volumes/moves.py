@@ -27,9 +27,9 @@ _DEEP = 0.1
 _NEAR, _MIRRORED = 0.75, 0.2
 """Largest distances of paired generators from a surface, and of one from the mirror image of the other, over h."""
 _SLANTED = 0.2
-"""Least singular value, over the largest, of a direction that the normals of the patches at a pair span."""
+"""Singular value, over the largest, of the normals at a pair, above which it does not move in that direction."""
 _FREE = 0.9
-"""Least distance between surfaces inside and moved generators without a partner, over h."""
+"""Distance from surfaces inside, over h, below which generators without a partner do not come nearer."""
 
 
 def fewest_rejected(
@@ -127,7 +127,7 @@ def moved(
     rows = rows[rows >= held]
     away = np.random.default_rng(move).normal(size=(len(rows), 3))
     away *= (_STEPS[move % len(_STEPS)] * sizes[rows] / np.linalg.norm(away, axis=1))[:, None]
-    sheets = None if domain.borders is None else domain.borders.sheets
+    sheets = domain.sheets
     group, room = np.arange(len(rows)), np.zeros(len(rows))
     if sheets is not None:
         rows, away, group = _along(sheets, points, sizes, rows, away)

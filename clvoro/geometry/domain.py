@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from .lines.obstacles import Obstacles
     from .polygon import Polygon
     from .sphere import Sphere
+    from .surfaces.sheets import Sheets
     from .wall_triangles import WallTriangles
 
 LARGEST_EDGE = 1e50
@@ -223,10 +224,15 @@ class Domain(ClipBox):
         return not self.cuts_cells and self.borders is None and self.wall_triangles is None
 
     @property
-    def landmarks(self) -> np.ndarray:
-        """Places (k, d) on all sides, without which cells of a part of a sphere would be unbounded; elsewhere none.
+    def sheets(self) -> Sheets | None:
+        """The surfaces inside, onto which vertices of meshes are moved; None without any."""
+        return None if self.borders is None else self.borders.sheets
 
-        All parts of a mesh know the nearest generators.
+    @property
+    def landmarks(self) -> np.ndarray:
+        """Places (k, d) all over a sphere; all parts of a mesh know the generators nearest to them. None elsewhere.
+
+        Without these generators cells of a part of a sphere would be unbounded.
         """
         return np.empty((0, self.dim))
 

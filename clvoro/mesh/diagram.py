@@ -207,9 +207,8 @@ class Diagram(MeshOutput):
     @cached_property
     def has_moved_vertices(self) -> bool:
         """Whether vertices are off the planes between generators: in solids, and beside curved surfaces inside."""
-        borders = self.domain.borders
-        inside = borders is not None and borders.sheets is not None
-        return self.domain.curved_walls or (inside and bool(self.half_faces.bent_cells.any()))
+        domain = self.domain
+        return domain.curved_walls or (domain.sheets is not None and bool(self.half_faces.bent_cells.any()))
 
     def __reduce__(self) -> tuple[Any, ...]:
         # Arrays that may still be on a device are read.

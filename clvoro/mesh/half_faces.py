@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 FLAT = 1e-6
-"""A face counts as plane if no corner is farther from its plane than this share of the cell's width."""
+"""Largest distance of a corner from the plane of a face that counts as plane, over the width of the cell."""
 
 
 class HalfFaceArrays:

@@ -414,10 +414,10 @@ def check_solid(check: Check, g: Rebuilt) -> None:
     )
     inner = np.ones(len(d.vertices), bool)
     inner[corners] = False
-    if domain.borders is not None and domain.borders.sheets is not None:
+    if domain.sheets is not None:
         placed = np.unique(take_rows(faces.starts, faces.corners, d.border_faces)[1])
         placed = placed[inner[placed]]
-        off = domain.borders.sheets.distance(d.vertices[placed])
+        off = domain.sheets.distance(d.vertices[placed])
         check.note(
             "surfaces inside",
             np.maximum(off - 10 * slack, 0),

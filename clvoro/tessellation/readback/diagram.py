@@ -47,7 +47,7 @@ def fetch_diagram(
     held : int
         How many of the first generators are not moved where OpenFOAM would reject cells.
     """
-    sheets = None if domain.borders is None else domain.borders.sheets
+    sheets = domain.sheets
     if domain.curved_walls:
         from .solid import make_mesh, read_generators
 
