@@ -145,13 +145,13 @@ def _made(diagram: Diagram, sheets: Sheets) -> _OnSurfaces:
 
 
 def _rejected(diagram: Diagram, among: np.ndarray) -> np.ndarray:
-    """Return which of the cells `among` (n,) bool, with a face on a surface or beside such a cell, OpenFOAM rejects."""
+    """Return the rejected cells (k,) `among` (n,) bool, of those with a face on a surface and their neighbors."""
     beside = _beside(diagram)
     return rejected_among(diagram.faces, beside & among, beside)
 
 
 def _around(mesh: Faces, row: int) -> np.ndarray:
-    """Return which cells have a corner of a face, or a neighbor with one, (n,) bool."""
+    """Return which cells share a corner with the face `row`, or have such a neighbor, (n,) bool."""
     corners = mesh.corners[mesh.starts[row] : mesh.starts[row + 1]]
     return with_neighbors(mesh, cells_of(mesh, rows_with(mesh.starts, np.isin(mesh.corners, corners))))
 

@@ -44,7 +44,7 @@ _BUDGET, _MOST = 12, 1000
 """Most changes of a rejected cell before others have their turn, and most searches for cures in meshes that are made
 one after another."""
 _EACH = 6
-"""Most searches in one mesh, on average of its rejected cells: parts of a cell may be cut again and again."""
+"""Most searches in one mesh over the number of its rejected cells: parts of a cell may be cut again and again."""
 _AHEAD = 1
 """Where no cure of a cell helps, cures of the cells that OpenFOAM rejects after it may follow: how many in turn."""
 _BRANCHES, _MOST_BAD = 2, 3

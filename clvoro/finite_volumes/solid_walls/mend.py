@@ -41,7 +41,7 @@ def rejected_at_walls(faces: Faces, judged: np.ndarray) -> np.ndarray:
 
 
 def rejected_among(faces: Faces, judged: np.ndarray, doubtful: np.ndarray) -> np.ndarray:
-    """Return which of the cells `judged` (n,) bool OpenFOAM rejects, (k,) int.
+    """Return the numbers (k,) of the cells that OpenFOAM rejects, of those `judged` (n,) bool.
 
     Only faces of `doubtful` cells (n,) bool are divided into tetrahedra, which takes the longest.
     """

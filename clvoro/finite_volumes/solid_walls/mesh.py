@@ -48,7 +48,7 @@ _SIMPLER, _SIMPLER_AFTER = 3, 2
 _BESIDE = 1.3
 """Distance over h up to which walls become simpler around rejected cells whose walls have no creases any more."""
 _CREASED = 3.0
-"""Walls of a cell farther from all creases than this, over h, are the same however they are made."""
+"""Distance from all creases, over h, beyond which a cell has the same walls however they are made."""
 _MISSED = 0.1
 """A crossing of a crease becomes a vertex of a chord on its face that is farther from it than this share of h."""
 
