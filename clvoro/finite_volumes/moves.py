@@ -142,7 +142,8 @@ def moved(
         whole[group[~good]] = False
         inside = whole[group]
         points[rows[inside]] = x[inside]
-        rows, away, group, room = (values[~inside] for values in (rows, away, group, room))
+        left = ~inside
+        rows, away, group, room = rows[left], away[left], group[left], room[left]
     return points
 
 

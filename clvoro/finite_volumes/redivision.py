@@ -204,7 +204,7 @@ class _Edit:
         for share in MOVED:
             new: dict[int, np.ndarray] = {}
             for (a, p, _), (_, b, _) in zip(loop, [*loop[1:], loop[0]], strict=True):
-                x, y, z = (new.get(k, self.points[k]) for k in (a, p, b))
+                x, y, z = (new[k] if k in new else self.points[k] for k in (a, p, b))
                 way = z - x
                 off = (y - x)[0] * way[1] - (y - x)[1] * way[0]
                 if off < STRAIGHT * (way @ way):
