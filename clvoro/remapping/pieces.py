@@ -9,6 +9,7 @@ import shapely
 
 from ..mesh.connectivity import following, take_rows
 from ..mesh.diagram import Diagram
+from ..mesh.geometry import sum_rows
 from ..mesh.half_faces import FLAT
 from ..mesh.lookup import cell_shapes
 
@@ -55,8 +56,7 @@ class Pieces:
 
     def summed(self, values: np.ndarray, n: int) -> np.ndarray:
         """Return for each of `n` cells the sum of `values` (k,) or (k, width) over its pieces."""
-        sums = [np.bincount(self.cells, column, n) for column in values.reshape(len(values), -1).T]
-        return np.stack(sums, axis=1).reshape(n, *values.shape[1:])
+        return sum_rows(self.cells, values.reshape(len(values), -1), n).reshape(n, *values.shape[1:])
 
 
 def _between_corners(diagram: Diagram) -> Pieces:
