@@ -25,6 +25,7 @@ from .io.arrays import FileError, array_names, explained, is_kind, read_array
 from .io.npz import FORMAT
 from .io.vtu_read import cell_data_of_vtu
 from .mesh.diagram import Diagram
+from .mesh.geometry import sum_rows
 from .mesh.results import Result
 from .shared import voronoi
 from .sizing.arguments import coverage_warnings
@@ -504,7 +505,7 @@ def _on_mesh(name: str, found: _Found, domain: Domain | None) -> tuple[Diagram, 
     values = {}
     for one, rows in found.values.items():
         columns = _of_dimension(rows[near].reshape(len(x), -1), domain.dim)
-        mean = np.stack([np.bincount(cell, column, count) * share for column in columns.T], axis=1)
+        mean = sum_rows(cell, columns, count) * share[:, None]
         values[one] = mean[:, 0] if rows.ndim == 1 else mean
     mesh = voronoi(domain, x[first])
     if mesh.home is not None:  # some cells of solids have several parts

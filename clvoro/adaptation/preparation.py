@@ -158,7 +158,7 @@ def _place_around(
         return place_in_corners(domain, free, fixed, rows, size, count.target) if drawn else None
     around = domain.borders.place(domain, free, size)
     check_beside_borders(around, domain, fixed)
-    if drawn and domain.borders.sheets is not None:
+    if drawn and domain.sheets is not None:
         corners = place_in_corners(domain, free, fixed, rows, size, count.target)
         around = around.with_others(corners, lambda x: _APART * np.asarray(size(x)))
     if (held := len(fixed) + len(around)) > count.target:

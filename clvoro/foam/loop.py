@@ -479,7 +479,7 @@ class _Loop:
             given = given.diagram
         if given is None:
             domain = foam.domain()
-            if domain.dim == 3:
+            if not foam.is_plane:
                 return foam.diagram(domain)
             with warnings.catch_warnings():
                 # The solver uses the mesh of the case, and not this diagram.

@@ -13,6 +13,7 @@ import scipy
 from ..errors import InputError
 from ..geometry.box import Box
 from ..mesh.diagram import Diagram
+from ..mesh.geometry import sum_rows
 from ..remapping.cell_data import conserved
 from .fields import WIDTHS, Entries, FoamField, Values
 from .fluxes import check_balance, project_fluxes
@@ -62,7 +63,7 @@ class MeshOfCase:
         if len(self.row) == n:
             return values
         volume = np.bincount(self.row, self.foam.volumes, n)
-        sums = np.stack([np.bincount(self.row, self.foam.volumes * v, n) for v in values.T], axis=1)
+        sums = sum_rows(self.row, self.foam.volumes[:, None] * values, n)
         empty = volume == 0
         means = sums / np.where(empty, 1, volume)[:, None]
         if empty.any():
