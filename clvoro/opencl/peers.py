@@ -167,7 +167,7 @@ class Peers:
         """
 
     def rest(self) -> Any:
-        """Wait for a `call` of this part, and return what it tells."""
+        """Wait for a `call` of this part, and return its message."""
 
     def fail(self, error: BaseException) -> None:
         """Tell the others that this part has failed. Those that wait for a message raise a `RankError`."""
@@ -290,7 +290,7 @@ class Ranks(Peers):
             raise RankError(self._failed)
 
     def call(self, count: int, message: object) -> None:
-        """Send them `message`, and the number of ranks that work."""
+        """Send `message`, and the number of ranks that now work, to the ranks that join."""
         if self.number == 0:
             more = range(self.count, count)
             self._complete([self._alarms.isend((count, message), part, CALL) for part in more])

@@ -121,14 +121,14 @@ class Threads(Peers):
         self._table.close(f"part {self.number} of {self.size} has failed: {type(error).__name__}: {error}")
 
     def call(self, count: int, message: object) -> None:
-        """Tell the threads themselves."""
+        """Give `message` to the threads that join."""
         if self.number == 0:
             for number in range(self.count, count):
                 self._table.call(number, (count, message))
         self.lead(count)
 
     def rest(self) -> Any:
-        """Wait for thread 0."""
+        """Wait for the call of thread 0."""
         count, message = self._table.rest(self.number)
         self.lead(count)
         return message
