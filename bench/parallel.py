@@ -9,11 +9,11 @@ box, or on a sphere, with sizes from h to 3 h, after a run of fewer cells, which
 processor time, summed over ranks, and `over one` the ratio to that of the first number of ranks. `floor` is the same
 ratio for as many processes at the same time that each make a mesh of n / p cells without messages: it has the cost of
 the fixed work of a step, and of shared cores and caches. `exchanges` and `reductions` are the rounds of messages
-between pairs of ranks, and of sums over all ranks, per step. Some of both take place at the same time; `waits` counts
-how often a rank waits for others. `ghosts` is the number of ghosts of rank 0 in the last diagram over
-2 d (n / p)^((d - 1) / d), an estimate of one layer of cells around a part. `one round` is the
-share of diagrams whose cells were made once, since no ghosts were missing, and `asked` how often ranks asked each other
-for ghosts, over the number of diagrams. Needs `pip install -e '.[mpi]'`.
+between pairs of ranks, and of sums over all ranks, per step in which all ranks work. Some of both take place at the
+same time; `waits` counts how often a rank waits for others. `ghosts` is the number of ghosts of rank 0 in the last
+diagram over 2 d (n / p)^((d - 1) / d), an estimate of one layer of cells around a part. `one round` is the share of
+diagrams whose cells were made once, since no ghosts were missing, and `asked` how often ranks asked each other for
+ghosts, over the number of diagrams. Needs `pip install -e '.[mpi]'`.
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ import numpy as np
 from _common import Report, counts, parser, run_ranks, shown
 
 import clvoro
+from clvoro.adaptation.run import Run
 from clvoro.tessellation.part_steps import PartSteps
 
 COLUMNS = {
@@ -58,6 +59,7 @@ def measure_rank(options: argparse.Namespace) -> None:
     x, domain = np.random.default_rng(1).random((cells, dim)), clvoro.Sphere(0.5) if options.sphere else box
     x, dim = x - 0.5 * options.sphere, domain.cell_dim
     adapter = clvoro.Adapter(clvoro.create_context(options.device), options.dtype, comm=comm)
+    peers = adapter._peers
     finish = PartSteps._finished
 
     def noted(steps, part, *given):
@@ -70,6 +72,13 @@ def measure_rank(options: argparse.Namespace) -> None:
         return found
 
     PartSteps._finished = noted
+    add_row, calls = Run._add_row, []
+
+    def counted(of, progress):
+        add_row(of, progress)
+        calls.append((peers.count == comm.size, of.steps, peers.exchanges, peers.reductions, peers.waits))
+
+    Run._add_row = counted
     whole = adapter.run(domain, cells ** (-1 / dim), points=x, method="lloyd", max_steps=0).gather()
     digest = hashlib.sha256()
     for name in ("neighbors", "volumes", "centroids", "face_measures") if whole is not None else ():
@@ -88,14 +97,15 @@ def measure_rank(options: argparse.Namespace) -> None:
     run(single, 4 * h)
     _, least = run(single, h * comm.size ** (1 / dim))
     rounds.clear()
-    asked[0], peers = 0, adapter._peers
-    calls = peers.exchanges, peers.reductions, peers.waits
+    calls.clear()
+    asked[0] = 0
     mesh, spent = run(adapter, h)
     steps = int(mesh.history["step"][-1])
     per_part = mesh.history["cells"][-1] / comm.size
     layer = 2 * dim * per_part ** ((dim - 1) / dim)
     if comm.rank == 0:
-        last = mesh.history[-1]
+        last, together = mesh.history[-1], np.array([row[1:] for row in calls if row[0]])
+        done, exchanges, reductions, waits = together[-1] - together[0]
         figures = {
             "ranks": comm.size,
             "cells": int(last["cells"]),
@@ -105,9 +115,9 @@ def measure_rank(options: argparse.Namespace) -> None:
             "cpu": spent,
             "least": least,
             "iterations": float(mesh.history["iterations"].sum() / steps),
-            "exchanges": (peers.exchanges - calls[0]) / steps,
-            "reductions": (peers.reductions - calls[1]) / steps,
-            "waits": (peers.waits - calls[2]) / steps,
+            "exchanges": exchanges / done,
+            "reductions": reductions / done,
+            "waits": waits / done,
             "ghosts": ghosts[0] / layer,
             "one_round": float(np.mean(np.array(rounds) == 1)) if comm.size > 1 else 1.0,
             "asked": asked[0] / len(rounds) if comm.size > 1 else 0.0,

@@ -1,7 +1,7 @@
 """Model of the time of a step over many ranks: the cells, the values of ghosts, and the waiting for messages.
 
-    python bench/rank_model.py [--cells 1e10] [--ranks 8,64,512,1000] [--dim 3] [--rate 5e6] [--exchanges 20]
-                               [--reductions 18] [--ghosts 2] [--words 1.5] [--bandwidth 2e10] [--latency 5e-6]
+    python bench/rank_model.py [--cells 1e10] [--ranks 8,64,512,1000] [--dim 3] [--rate 5e6] [--exchanges 25]
+                               [--reductions 20] [--ghosts 2] [--words 1.5] [--bandwidth 2e10] [--latency 5e-6]
                                [--copy 2e-5] [--json]
 
 Nothing is measured here. Assumptions, each of them an option:
@@ -49,8 +49,8 @@ def main() -> None:
     p.add_argument("--ranks", type=counts, default=[8, 64, 512, 1000], help="numbers of ranks")
     p.add_argument("--dim", type=int, choices=(2, 3), default=3, help="dimension")
     p.add_argument("--rate", type=float, default=5e6, help="cells per second of a device")
-    p.add_argument("--exchanges", type=float, default=20, help="exchanges of ghosts in a step")
-    p.add_argument("--reductions", type=float, default=18, help="sums over all ranks in a step")
+    p.add_argument("--exchanges", type=float, default=25, help="exchanges of ghosts in a step")
+    p.add_argument("--reductions", type=float, default=20, help="sums over all ranks in a step")
     p.add_argument("--ghosts", type=float, default=2, help="ghosts over one layer around a part")
     p.add_argument("--words", type=float, default=1.5, help="numbers per ghost in an exchange")
     p.add_argument("--bandwidth", type=float, default=2e10, help="bytes per second and rank")
