@@ -1,4 +1,4 @@
-"""The TRiSK scheme on a diagram on a sphere: metric terms, operators as sparse matrices, shallow-water equations.
+"""The TRiSK scheme on an MPAS file of a sphere: operators as sparse matrices, shallow-water equations.
 
 Sources: Thuburn, Ringler, Skamarock and Klemp 2009, J. Comput. Phys. 228, 8321 (T09), for the tangential velocity;
 Ringler, Thuburn, Klemp and Skamarock 2010, J. Comput. Phys. 229, 3065 (R10), for the nonlinear equations.
@@ -10,31 +10,15 @@ second.
 
 from __future__ import annotations
 
+import tempfile
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from scipy import sparse
+from scipy.io import netcdf_file
 
 import clvoro
-
-SHORTEST_EDGE = 1e-9
-"""Least ratio of the length of a face to the distance of its generators: below, gradients along faces are round-off."""
-
-
-def signed_areas(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
-    """Return the areas (n,) of triangles on the unit sphere, positive if counter-clockwise from outside.
-
-    The formula of Van Oosterom and Strackee 1983, with differences in the numerator, so that small triangles keep
-    their digits.
-    """
-    volume = np.einsum("ij,ij->i", a, np.cross(b - a, c - a))
-    dots = (np.einsum("ij,ij->i", x, y) for x, y in ((a, b), (b, c), (c, a)))
-    return 2 * np.arctan2(volume, 1 + sum(dots))
-
-
-def arcs(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Return the angles (n,) between unit vectors (n, 3)."""
-    return 2 * np.arcsin(np.linalg.norm(a - b, axis=1) / 2)
 
 
 def unit(x: np.ndarray) -> np.ndarray:
@@ -42,75 +26,43 @@ def unit(x: np.ndarray) -> np.ndarray:
     return x / np.linalg.norm(x, axis=1, keepdims=True)
 
 
-def pair_half_faces(cells: np.ndarray, neighbors: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return for each edge its half-face of the lower cell (m,), and for each half-face its edge and its sign (2 m,).
-
-    The sign is 1 on the half-face whose cell is the edge's first.
-
-    Raises
-    ------
-    ValueError
-        If a half-face has no twin, or two cells share more than one face.
-    """
-    low, high = np.minimum(cells, neighbors), np.maximum(cells, neighbors)
-    order = np.lexsort((cells, high, low))
-    first, second = order[::2], order[1::2]
-    twins = (low[first] == low[second]) & (high[first] == high[second])
-    twins &= cells[first] != cells[second]
-    repeated = (low[first][1:] == low[first][:-1]) & (high[first][1:] == high[first][:-1])
-    if not twins.all() or repeated.any():
-        raise ValueError(
-            "a face has no twin, or two cells share several faces; expected one face for each pair of neighbors: "
-            "use a mesh of more cells"
-        )
-    edge_of, sign = np.empty(len(cells), int), np.empty(len(cells))
-    edge_of[first] = edge_of[second] = np.arange(len(first))
-    sign[first], sign[second] = 1, -1
-    return first, edge_of, sign
-
-
 @dataclass(frozen=True)
 class Mesh:
-    """Metric terms of the C grid; n cells, m edges, v vertices. Lengths in the unit of `radius`.
+    """The C grid of a file; n cells, m edges, v vertices. Lengths in the unit of the radius.
 
     Attributes
     ----------
-    radius : float
     points, corners, crossings : (n, 3), (v, 3) and (m, 3) float arrays
         Unit vectors: generators, vertices, and middles of the arcs between two generators, where these cross the great
         circles of the faces.
-    starts, edge_of, sign : (n + 1,), (2 m,) and (2 m,) arrays
-        The half-faces of cell i are starts[i] to starts[i + 1], counter-clockwise: their edges, and 1 where the normal
-        points out of the cell, else -1.
     edge_cells, edge_vertices : (m, 2) int arrays
     dc, dv : (m,) float arrays
         Arc between the generators, and length of the face.
-    corner_vertex, kites : (2 m,) arrays
-        Corner k is the begin of half-face k: its vertex, and the area that its cell and the vertex share.
-    cell_areas, vertex_areas : (n,) and (v,) float arrays
-        Sums of kites.
+    kites : (v, n) sparse
+        The area that a vertex and a cell share.
+    tangential : (m, m) sparse
+        From normal to tangential components of a field on edges (T09).
     """
 
-    radius: float
     points: np.ndarray
     corners: np.ndarray
     crossings: np.ndarray
-    starts: np.ndarray
-    edge_of: np.ndarray
-    sign: np.ndarray
     edge_cells: np.ndarray
     edge_vertices: np.ndarray
     dc: np.ndarray
     dv: np.ndarray
-    corner_vertex: np.ndarray
-    kites: np.ndarray
-    cell_areas: np.ndarray
-    vertex_areas: np.ndarray
+    kites: sparse.csr_array
+    tangential: sparse.csr_array
 
     @property
-    def half_cell(self) -> np.ndarray:
-        """Cell of each half-face and corner, (2 m,)."""
-        return np.repeat(np.arange(len(self.points)), np.diff(self.starts))
+    def cell_areas(self) -> np.ndarray:
+        """Sums of kites, (n,)."""
+        return self.kites.sum(axis=0)
+
+    @property
+    def vertex_areas(self) -> np.ndarray:
+        """Sums of kites, (v,)."""
+        return self.kites.sum(axis=1)
 
     @property
     def edge_areas(self) -> np.ndarray:
@@ -118,62 +70,32 @@ class Mesh:
         return self.dc * self.dv
 
 
-def next_in_cell(starts: np.ndarray, step: int = 1) -> np.ndarray:
-    """Return for each half-face the one `step` further counter-clockwise in the same cell, (2 m,)."""
-    sides = np.diff(starts)
-    begin, count = np.repeat(starts[:-1], sides), np.repeat(sides, sides)
-    return begin + (np.arange(starts[-1]) - begin + step) % count
-
-
 def mesh_of(diagram: clvoro.Diagram) -> Mesh:
-    """Return the metric terms of a diagram on a sphere.
+    """Return the C grid of a diagram on a sphere, as a model reads it from the file."""
+    with tempfile.TemporaryDirectory() as folder:
+        diagram.to_netcdf(path := Path(folder) / "mesh.nc", convention="mpas")
+        with netcdf_file(path, mmap=False) as file:
+            found = {
+                name: np.array(each[:], each.data.dtype.newbyteorder("=")) for name, each in file.variables.items()
+            }
 
-    Raises
-    ------
-    ValueError
-        If the domain is no sphere, a vertex has other than three cells, two cells share several faces, or a face is
-        shorter than `SHORTEST_EDGE` times the distance of its generators.
-    """
-    if not isinstance(diagram.domain, clvoro.Sphere):
-        raise ValueError(f"got a diagram on a {type(diagram.domain).__name__}, expected a Sphere")
-    radius = diagram.domain.radius
-    points, corners = unit(diagram.points), unit(diagram.vertices)
-    starts = np.asarray(diagram.neighbor_starts, int)
-    vertex = np.asarray(diagram.cell_vertices, int)
-    if not (np.bincount(vertex, minlength=len(corners)) == 3).all():
-        raise ValueError("a vertex has other than three cells; expected generators in general position")
-    cells, neighbors = np.repeat(np.arange(len(points)), np.diff(starts)), diagram.neighbors
-    first, edge_of, sign = pair_half_faces(cells, np.asarray(neighbors, int))
-    after = next_in_cell(starts)
-    edge_cells = np.column_stack([cells[first], neighbors[first]])
-    edge_vertices = np.column_stack([vertex[first], vertex[after][first]])
-    crossings = unit(points[edge_cells].sum(axis=1))
-    dc = radius * arcs(*points[edge_cells.T])
-    dv = radius * arcs(*corners[edge_vertices.T])
-    if (dv < SHORTEST_EDGE * dc).any():
-        raise ValueError(f"a face is shorter than {SHORTEST_EDGE:g} of the distance of its generators")
+    def places(what: str) -> np.ndarray:
+        return unit(np.column_stack([found[f"{axis}{what}"] for axis in "xyz"]))
 
-    # A kite is two triangles: from the crossing of the face that ends at the corner, and of the one that begins there.
-    x, middle = points[cells], crossings[edge_of]
-    kites = signed_areas(x, corners[vertex], middle)
-    np.add.at(kites, after, signed_areas(x, middle, corners[vertex[after]]))
-    kites *= radius**2
+    def table(values: str, columns: str, width: int) -> sparse.csr_array:
+        column, value = found[columns] - 1, found[values]
+        row, place = np.nonzero(column >= 0)
+        return sparse_matrix(value[row, place], row, column[row, place], len(value), width)
+
+    n, m = len(found["areaCell"]), len(found["dcEdge"])
     return Mesh(
-        radius,
-        points,
-        corners,
-        crossings,
-        starts,
-        edge_of,
-        sign,
-        edge_cells,
-        edge_vertices,
-        dc,
-        dv,
-        vertex,
-        kites,
-        np.add.reduceat(kites, starts[:-1]),
-        np.bincount(vertex, kites),
+        *map(places, ("Cell", "Vertex", "Edge")),
+        found["cellsOnEdge"] - 1,
+        found["verticesOnEdge"] - 1,
+        found["dcEdge"],
+        found["dvEdge"],
+        table("kiteAreasOnVertex", "cellsOnVertex", n),
+        table("weightsOnEdge", "edgesOnEdge", m),
     )
 
 
@@ -181,29 +103,6 @@ def sparse_matrix(values: np.ndarray, rows: np.ndarray, columns: np.ndarray, *sh
     """Return a sparse matrix. With indices of 32 bits a product reads a quarter less."""
     indices = rows.astype(np.int32), columns.astype(np.int32)
     return sparse.csr_array((values, indices), shape=shape)
-
-
-def tangential(mesh: Mesh) -> sparse.csr_array:
-    """Return the matrix (m, m) from normal to tangential components of a field on edges (T09).
-
-    From edge e go counter-clockwise around one of its two cells to edge e', over kites of the shares R of the cell:
-    the weight is +-(1/2 - sum R) dv(e') / dc(e), positive if both normals point out of the cell or both into it.
-    """
-    sides = np.diff(mesh.starts)
-    count = np.repeat(sides, sides)
-    share = mesh.kites / mesh.cell_areas[mesh.half_cell]
-    half, passed = np.arange(len(count)), np.zeros(len(count))
-    rows, columns, weights = [], [], []
-    for step in range(1, int(sides.max())):
-        other = next_in_cell(mesh.starts, step)
-        passed = passed + share[other]
-        used = half[count > step]
-        rows.append(mesh.edge_of[used])
-        columns.append(mesh.edge_of[other[used]])
-        weights.append(mesh.sign[used] * mesh.sign[other[used]] * (0.5 - passed[used]))
-    row, column = np.concatenate(rows), np.concatenate(columns)
-    value = np.concatenate(weights) * mesh.dv[column] / mesh.dc[row]
-    return sparse_matrix(value, row, column, len(mesh.dc), len(mesh.dc))
 
 
 class Operators:
@@ -218,7 +117,7 @@ class Operators:
     curl : (v, m)
         Vorticity on vertices.
     tangential : (m, m)
-        Tangential component, see `tangential`.
+        Tangential component.
     kinetic : (n, m)
         Kinetic energy per mass in cells, of squared normal velocities.
     cell_to_edge, vertex_to_edge : (m, n), (m, v)
@@ -231,24 +130,18 @@ class Operators:
 
     def __init__(self, mesh: Mesh) -> None:
         n, m, v = len(mesh.points), len(mesh.dc), len(mesh.corners)
-        cell, edge, edges = mesh.half_cell, mesh.edge_of, np.arange(m)
-        both = np.repeat(edges, 2)
-        signs = np.tile([-1.0, 1.0], m)
-
-        pairs, ends = mesh.edge_cells.ravel(), mesh.edge_vertices.ravel()
-        area = mesh.cell_areas[cell]
-        self.div = sparse_matrix(mesh.sign * mesh.dv[edge] / area, cell, edge, n, m)
-        self.grad = sparse_matrix(signs / mesh.dc[both], both, pairs, m, n)
+        both, signs, half = np.repeat(np.arange(m), 2), np.tile([-1.0, 1.0], m), np.full(2 * m, 0.5)
+        cells, ends, area = mesh.edge_cells.ravel(), mesh.edge_vertices.ravel(), mesh.cell_areas
+        self.div = sparse_matrix(-signs * mesh.dv[both] / area[cells], cells, both, n, m)
+        self.grad = sparse_matrix(signs / mesh.dc[both], both, cells, m, n)
         self.curl = sparse_matrix(signs * mesh.dc[both] / mesh.vertex_areas[ends], ends, both, v, m)
         self.along = sparse_matrix(signs / mesh.dv[both], both, ends, m, v)
-        self.tangential = tangential(mesh)
-        self.kinetic = sparse_matrix(mesh.edge_areas[edge] / (4 * area), cell, edge, n, m)
-        half = np.full(2 * m, 0.5)
-        self.cell_to_edge = sparse_matrix(half, both, pairs, m, n)
+        self.tangential = mesh.tangential
+        self.kinetic = sparse_matrix(mesh.edge_areas[both] / (4 * area[cells]), cells, both, n, m)
+        self.cell_to_edge = sparse_matrix(half, both, cells, m, n)
         self.vertex_to_edge = sparse_matrix(half, both, ends, m, v)
-        vertex = mesh.corner_vertex
-        self.cell_to_vertex = sparse_matrix(mesh.kites / mesh.vertex_areas[vertex], vertex, cell, v, n)
-        self.vertex_to_cell = sparse_matrix(mesh.kites / area, cell, vertex, n, v)
+        self.cell_to_vertex = mesh.kites.multiply(1 / mesh.vertex_areas[:, None]).tocsr()
+        self.vertex_to_cell = mesh.kites.multiply(1 / area).T.tocsr()
 
 
 class ShallowWater:

@@ -6,7 +6,7 @@
                                   [--courant 0.8] [--upwinding 0] [--quick] [--truncation]
                                   [--device NAME] [--dtype float32] [--json]
 
-The solver (`_trisk.py`) is NumPy and SciPy; it takes nothing but a `Diagram`. Test 2 is a steady zonal flow, rotated
+The solver (`_trisk.py`) is NumPy and SciPy; it takes nothing but an MPAS file. Test 2 is a steady zonal flow, rotated
 by --alpha degrees: 5 days, norms of the error of height. Test 5 is a flow over a mountain: 15 days, norms of the
 difference of the final surface height from that on the last mesh of the run, or on an icosahedral mesh of --reference
 cells (Williamson et al. 1992, J. Comput. Phys. 102, 211); "l2 near" counts the cells within 30 degrees of the top of
