@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 from _common import FIRST_SEED, PICTURES, SHAPE_COLUMNS, Report, figures, heading, make_adapter, names, parser
-from polygon import lake
+from _sites import rough_lake
 
 import clvoro
 from clvoro import sizing
@@ -108,7 +108,7 @@ def composition() -> Example:
 
 
 def shore() -> Example:
-    domain = lake(900, rough=0.2)
+    domain = rough_lake(900, rough=0.2)
     size = sizing.FeatureSize(domain, cells_across=8, growth=1.25, h_min=0.016, h_max=0.11)
     return Example("FeatureSize(Polygon(shore, [island]), 8)", size, domain=domain)
 
