@@ -264,6 +264,9 @@ class Options:
             raise InputTypeError(f"layers is {layers!r}, expected clvoro.Layers or a sequence of them{hint}")
         _check_numbers(self)
         object.__setattr__(self, "layers", (layers,) if isinstance(layers, Layers) else tuple(layers))
+        for layer in self.layers:
+            if not isinstance(layer, Layers):
+                raise InputTypeError(f"layers has a {type(layer).__name__}, expected clvoro.Layers")
         if self.layers and self.method == "transport":
             raise InputError(
                 "layers are given with the method transport, expected none: the cells of a power diagram do not keep "

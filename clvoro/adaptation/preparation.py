@@ -11,7 +11,6 @@ import numpy as np
 
 from ..arguments import coincident_named, warn
 from ..errors import CoarseSizeWarning, InputError, SizeFieldError
-from ..geometry.boundary_layers import apart_from
 from ..geometry.domain import Domain
 from ..geometry.fixed_generators import FixedGenerators
 from ..geometry.gaps import NARROW
@@ -336,14 +335,14 @@ def _is_narrow(setup: Setup, coarseness: float) -> bool:
 
 def start(prepared: Prepared) -> MeshState:
     """Return the mesh of the initial generators: those of layers, then those of the caller or a random sample."""
-    setup, rows, levels = prepared.setup, prepared.layout.rows, prepared.levels
+    setup, layout, levels = prepared.setup, prepared.layout, prepared.levels
     domain, engine, fixed = setup.domain, setup.stages.engine, setup.points
     host = prepared.points if prepared.lattice is None else prepared.lattice
     if host is None:
         host = _sample(prepared)
     check_precision(setup.sizing, domain, host, setup.factor)
-    if len(rows):
-        host = np.concatenate([rows, host[apart_from(host, rows, setup.free)]])
+    if len(layout.rows):
+        host = np.concatenate([layout.rows, host[layout.beyond(host)]])
     placed = domain.place(host, engine.real)
     labels = np.arange(setup.first_row, setup.first_row + len(host), dtype=np.int32)
     taken = np.full(len(fixed), -1, np.int32)

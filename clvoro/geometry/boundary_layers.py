@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, cast
 
 import numpy as np
@@ -15,7 +16,7 @@ from ..errors import InputError, InputTypeError
 from .boundary_names import Walls
 from .box import Box
 from .domain import Domain
-from .layer_columns import Chain, count_columns, count_fan, find_chains, place_columns, place_fan
+from .layer_columns import count_columns, count_fan, find_chains, place_columns, place_fan
 from .polygon import Polygon
 
 if TYPE_CHECKING:
@@ -149,78 +150,313 @@ def _numbers_or_names(edges: object) -> tuple[int | str, ...]:
     return tuple(e if isinstance(e, str) else check_integer("Layers edges", e, 0) for e in items)
 
 
-def place_layers(domain: Domain, layers: Sequence[Layers]) -> np.ndarray:
-    """Return the generators (n, 2) of `layers` in `domain`.
+class LayerRows:
+    """Layers along walls in 2D: rows of generators that do not move, in columns normal to the walls.
 
-    In corners and narrow gaps, where layers of several walls overlap, a generator is kept for its nearest wall.
+    Parameters
+    ----------
+    domain : Box or Polygon
+    layers : sequence of Layers
+
+    Attributes
+    ----------
+    polygon : Polygon
+        The domain.
+    edges : (e, 2, 2) float
+        Both ends of its oriented edges.
+    chosen, chains : list of (e,) bool, list of list of Chain
+        For each of the layers, the edges that have it, and these joined.
 
     Raises
     ------
     InputError
-        If no generator of the layers is in the domain, or an edge does not exist.
+        If an edge does not exist.
     InputTypeError
         If the domain is neither a `Box` nor a `Polygon` in 2D.
     """
-    polygon, _ = as_polygon(domain)
-    found, limits, walls = [np.empty((0, 2))], [np.empty(0)], [np.empty(0)]
-    for layer in layers:
-        for chain in _chains(domain, layer):
-            feet, normals = place_columns(chain, layer.width, layer.height)
+
+    def __init__(self, domain: Domain, layers: Sequence[Layers]) -> None:
+        self.domain, self.layers = domain, layers
+        self.polygon, numbers = _as_polygon(domain)
+        oriented = self.polygon.oriented
+        self.edges = np.stack([oriented.vertices, oriented.ends], axis=1)
+        self.chosen = [np.isin(numbers, domain.boundaries.select("Layers edges", layer.edges)) for layer in layers]
+        if not all(chosen.any() for chosen in self.chosen):
+            raise InputError("Layers edges has only edges without length, expected one with a length")
+        self.chains = [find_chains(self.polygon, chosen) for chosen in self.chosen]
+
+    def count(self) -> int:
+        """Return the number of generators that `points` begins with, without placing any.
+
+        Raises
+        ------
+        InputError
+            If the layers of one wall alone fill the domain.
+        """
+        total = 0
+        for layer, chains in zip(self.layers, self.chains, strict=True):
+            if not layer.thickness + _APART * layer.width < np.linalg.norm(self.domain.extent):
+                raise InputError(_NO_ROOM)
+            columns = sum(count_columns(chain, layer.width, layer.height) for chain in chains)
+            total += columns * (layer.count + 1)
+            total += sum(count_fan(chain, layer.width, y) for chain in chains for y in layer.rows)
+        return total
+
+    @cached_property
+    def _columns(self) -> list[list[tuple[np.ndarray, np.ndarray]]]:
+        """Feet and unit normals, (c, 2) each, of the columns of each chain of each of the layers."""
+        return [
+            [place_columns(chain, layer.width, layer.height) for chain in chains]
+            for layer, chains in zip(self.layers, self.chains, strict=True)
+        ]
+
+    def columns(self, k: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return feet (c, 2) on the walls and unit normals (c, 2) of all columns of layer `k`."""
+        feet, normals = zip(*self._columns[k], strict=True)
+        return np.concatenate(feet), np.concatenate(normals)
+
+    def segments(self, k: int) -> np.ndarray:
+        """Return the edges that have layer `k`, (e, 2, 2): both ends of each."""
+        return self.edges[self.chosen[k]]
+
+    @cached_property
+    def points(self) -> np.ndarray:
+        """The generators, (n, 2).
+
+        In corners and narrow gaps, where layers of several walls overlap, a generator is kept for its nearest wall.
+
+        Raises
+        ------
+        InputError
+            If none is in the domain.
+        """
+        found, limits, walls = [np.empty((0, 2))], [np.empty(0)], [np.empty(0)]
+        for layer, chains, columns in zip(self.layers, self.chains, self._columns, strict=True):
             near = min(layer.width, layer.heights.min())
-            for y in layer.rows:
-                fan = place_fan(chain, layer.width, y)
-                apart = chain.fan * y / max(len(fan) - 1, 1)
-                found += [feet + y * normals, fan]
-                limits += [np.full(len(feet), _NEAR * near), np.full(len(fan), _NEAR * min(near, apart))]
-                walls.append(np.full(len(feet) + len(fan), y))
-    points, limit, wall = (np.concatenate(x) for x in (found, limits, walls))
-    kept = polygon.contains(points)
-    segments = np.concatenate([chosen_segments(domain, layer) for layer in layers])
-    kept[kept] = _distances(points[kept], segments) >= _OWN * wall[kept]
-    points, limit = points[kept], limit[kept]
-    # In every chain the nearest rows to the wall come first. Of two generators too near, drop the later one.
-    close = (
-        scipy.spatial.KDTree(points).query_pairs(limit.max(), output_type="ndarray")
-        if len(points)
-        else np.empty((0, 2), int)
-    )
-    apart = np.hypot(*(points[close[:, 0]] - points[close[:, 1]]).T)
-    close = close[apart < np.minimum(limit[close[:, 0]], limit[close[:, 1]])]
-    gone = np.zeros(len(points), bool)
-    for i, j in close[np.lexsort(close.T[::-1])].tolist():
-        if not gone[i]:
-            gone[j] = True
-    points = points[~gone]
-    if not len(points):
-        raise InputError(
-            f"layers of thickness {[layer.thickness for layer in layers]} do not fit between the walls of the domain; "
-            "make them thinner"
+            for chain, (feet, normals) in zip(chains, columns, strict=True):
+                for y in layer.rows:
+                    fan = place_fan(chain, layer.width, y)
+                    apart = chain.fan * y / max(len(fan) - 1, 1)
+                    found += [feet + y * normals, fan]
+                    limits += [np.full(len(feet), _NEAR * near), np.full(len(fan), _NEAR * min(near, apart))]
+                    walls.append(np.full(len(feet) + len(fan), y))
+        points, limit, wall = (np.concatenate(x) for x in (found, limits, walls))
+        kept = self.polygon.contains(points)
+        segments = np.concatenate([self.segments(k) for k in range(len(self.layers))])
+        kept[kept] = _distances(points[kept], segments) >= _OWN * wall[kept]
+        points, limit = points[kept], limit[kept]
+        # In every chain the nearest rows to the wall come first. Of two generators too near, drop the later one.
+        close = (
+            scipy.spatial.KDTree(points).query_pairs(limit.max(), output_type="ndarray")
+            if len(points)
+            else np.empty((0, 2), int)
         )
-    return points
+        apart = np.hypot(*(points[close[:, 0]] - points[close[:, 1]]).T)
+        close = close[apart < np.minimum(limit[close[:, 0]], limit[close[:, 1]])]
+        gone = np.zeros(len(points), bool)
+        for i, j in close[np.lexsort(close.T[::-1])].tolist():
+            if not gone[i]:
+                gone[j] = True
+        points = points[~gone]
+        if not len(points):
+            raise InputError(
+                f"layers of thickness {[layer.thickness for layer in self.layers]} do not fit between the walls of the "
+                "domain; make them thinner"
+            )
+        return points
+
+    def outer_segments(self, k: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return the parts (m, 2, 2) of the last row of layer `k` between neighboring columns, and their widths (m,).
+
+        Widths are their lengths, but at least `_NEAR` of that between the feet of the columns: in corners columns of
+        two walls come close together. Parts that are outside of the domain, or nearer to another wall, are left out. If
+        none is left, they are the edges with the layer.
+        """
+        layer, y = self.layers[k], float(self.layers[k].rows[-1])
+        found, least = [np.empty((0, 2, 2))], [np.empty(0)]
+        for chain, (feet, normals) in zip(self.chains[k], self._columns[k], strict=True):
+            if chain.closed:
+                feet, normals = (np.concatenate([x, x[:1]]) for x in (feet, normals))
+            row, fan = feet + y * normals, place_fan(chain, layer.width, y)
+            found += [np.stack([part[:-1], part[1:]], axis=1) for part in (row, fan)]
+            least += [_NEAR * np.hypot(*np.diff(feet, axis=0).T), np.zeros(max(len(fan) - 1, 0))]
+        segments = np.concatenate(found)
+        widths = np.maximum(np.hypot(*(segments[:, 1] - segments[:, 0]).T), np.concatenate(least))
+        middles, walls = segments.mean(axis=1), self.segments(k)
+        kept = self.polygon.contains(middles)
+        kept[kept] = _distances(middles[kept], walls) >= _OWN * y
+        return (segments[kept], widths[kept]) if kept.any() else (walls, np.full(len(walls), layer.width))
+
+    @cached_property
+    def free(self) -> Domain:
+        """The part of the domain beyond the layers, for generators that move; it has the frame of the domain.
+
+        It begins a third of a width from the last row.
+
+        Raises
+        ------
+        InputError
+            If nothing is left.
+        """
+        domain = self.domain
+        distances = [float(layer.rows[-1]) + _APART * layer.width for layer in self.layers]
+        if domain.outline is None:
+            corners = np.array([domain.lower, domain.upper])
+            for layer, distance in zip(self.layers, distances, strict=True):
+                for wall in domain.boundaries.select("Layers edges", layer.edges).tolist():
+                    axis, end = divmod(wall, 2)
+                    moved = (domain.lower, domain.upper)[end][axis] + (-distance if end else distance)
+                    corners[end, axis] = (min if end else max)(corners[end, axis], moved)
+            if not (corners[0] < corners[1]).all():
+                raise InputError(_NO_ROOM)
+            free = Box(tuple(corners[0]), tuple(corners[1]), domain.periodic)
+            object.__setattr__(free, "framed_by", domain)
+            return free
+        # Merged to long lines first: the strips around thousands of short edges would overlap many times.
+        lines = (shapely.union_all(np.asarray(shapely.linestrings(self.segments(k)))) for k in range(len(distances)))
+        strips = [shapely.line_merge(line).buffer(distance) for line, distance in zip(lines, distances, strict=True)]
+        left = self.polygon.geometry.difference(shapely.union_all(strips))
+        # Where a strip ends beside a corner, an edge as short as round-off may remain.
+        left = shapely.make_valid(shapely.remove_repeated_points(left, _SHORT * float(domain.extent.max())))
+        every = [part for some in shapely.get_parts(left) for part in shapely.get_parts(some)]
+        parts = [part for part in every if part.area > 1e-6 * domain.measure]
+        if not parts:
+            raise InputError(_NO_ROOM)
+        inner = Polygon.from_shapely(shapely.MultiPolygon(parts))
+        inner.framed_by = self.polygon
+        return inner
+
+    def beyond(self, points: np.ndarray) -> np.ndarray:
+        """Return which of `points` (n, 2) lie in the `free` domain and differ from the generators, (n,) bool."""
+        return np.asarray(self.free.contains(points) & (scipy.spatial.KDTree(self.points).query(points)[0] > 0))
+
+    def check_gaps(self) -> None:
+        """Refuse layers that are thicker than the gap between two walls along much of their length.
+
+        In a narrow place, where layers of two walls overlap, each row is kept for its nearest wall. Layers that reach
+        beyond the middle of a long gap give spikes.
+
+        Raises
+        ------
+        InputError
+            With the place of a narrow gap, and the largest thickness that fits there.
+        """
+        begin, end = self.edges.swapaxes(0, 1)
+        thickness = np.zeros(len(begin))
+        for layer, chosen in zip(self.layers, self.chosen, strict=True):
+            thickness[chosen] = np.maximum(thickness[chosen], layer.rows[-1])
+        for k, layer in enumerate(self.layers):
+            feet, normals = self.columns(k)
+            gaps, walls = _opposite(feet, normals, begin, end)
+            needed = float(layer.rows[-1]) + np.where(walls >= 0, thickness[walls], 0.0)
+            tight = needed > gaps
+            if tight.mean() <= _TIGHT:
+                continue
+            # In sharp corners columns are in ever narrower gaps: a few of the narrowest are passed over.
+            worst = int(np.argsort(gaps / needed, kind="stable")[int(_TIGHT / 2 * len(gaps))])
+            fits = _FILLED * layer.thickness * gaps[worst] / needed[worst]
+            raise InputError(
+                f"layers[{k}] are {layer.thickness:.3g} thick, and the gap at {format_point(feet[worst])} is "
+                f"{gaps[worst]:.3g} wide{', with layers on both sides' if thickness[walls[worst]] else ''}, expected a "
+                f"thickness of at most {fits:.3g}; use fewer or thinner layers, or leave out these edges"
+            )
 
 
-def count_rows(domain: Domain, layers: Sequence[Layers]) -> int:
-    """Return the number of generators that `place_layers` begins with, without placing any.
+class LayerPrisms:
+    """Layers along walls of a solid: prisms over the polygons on the walls, in the mesh for solvers.
+
+    Parameters
+    ----------
+    solid : Solid
+    layers : sequence of Layers
 
     Raises
     ------
     InputError
-        If the layers of one wall alone fill the domain, or an edge does not exist.
-    InputTypeError
-        If an item is not `Layers`, or the domain is neither a `Box` nor a `Polygon` in 2D.
+        If layers are too many, a layer has a spacing, a patch has several layers, layers are thicker than the solid, or
+        patches that meet have layers of different count.
     """
-    total = 0
-    for layer in layers:
-        chains = _chains(domain, layer)
-        if not layer.thickness + _APART * layer.width < np.linalg.norm(domain.extent):
-            raise InputError(_NO_ROOM)
-        columns = sum(count_columns(chain, layer.width, layer.height) for chain in chains)
-        total += columns * (layer.count + 1)
-        total += sum(count_fan(chain, layer.width, y) for chain in chains for y in layer.rows)
-    return total
+
+    def __init__(self, solid: Domain, layers: Sequence[Layers]) -> None:
+        self.layers, self.free = layers, cast("Solid", solid)
+        self.points = np.empty((0, 3))
+        """As `LayerRows` have them."""
+        boundaries = solid.boundaries
+        self._chosen = [boundaries.select("Layers edges", layer.edges) for layer in layers]
+        names = [solid.boundary_names[k] for k in solid.boundary_index]
+        count = np.zeros(len(boundaries.index), np.int64)
+        for k, (layer, walls) in enumerate(zip(layers, self._chosen, strict=True)):
+            if layer.count > _MOST:
+                raise InputError(f"layers[{k}] has count = {layer.count}, expected at most {_MOST}; use fewer layers")
+            if layer.spacing is not None:
+                raise InputError(
+                    f"layers[{k}] has spacing = {layer.spacing:g}, expected none in a solid, where prisms are as wide "
+                    "as the cells beside them; leave spacing out, and give the size field this value at the wall"
+                )
+            if not layer.thickness < np.linalg.norm(solid.extent) / 2:
+                raise InputError(_NO_ROOM)
+            if count[walls].any():
+                raise InputError(
+                    f"layers[{k}] are on {names[walls[count[walls] > 0][0]]!r}, which has other layers, expected one "
+                    "of them for each patch; name other patches in edges"
+                )
+            count[walls] = layer.count
+        meeting = count[solid.meeting_walls]
+        wrong = np.flatnonzero((meeting > 0).all(axis=1) & (meeting[:, 0] != meeting[:, 1]))
+        if wrong.size:
+            one, other = (names[wall] for wall in solid.meeting_walls[wrong[0]].tolist())
+            a, b = meeting[wrong[0]].tolist()
+            raise InputError(
+                f"layers have count {a} on {one!r} and {b} on {other!r}, which meet at a crease, expected one count; "
+                f"give both count={max(a, b)}, with heights of your choice"
+            )
+
+    @cached_property
+    def walls(self) -> list[Surface]:
+        """The walls that have each of the layers."""
+        return [cast("Surface", self.free.boundary(layer.edges)) for layer in self.layers]
+
+    def sample(self, k: int, size: Callable[[np.ndarray], np.ndarray], most: int) -> np.ndarray:
+        """Return `size` at up to `most` points on the walls of layer `k`, (m,) float."""
+        return np.asarray(size(self.walls[k].landmarks(float(self.free.extent.min()) / 8, most)), float)
+
+    def count(self, size: Callable[[np.ndarray], np.ndarray]) -> float:
+        """Return about how many prisms there are, where wall polygons are as wide as `size` at points."""
+        total = 0.0
+        for k, layer in enumerate(self.layers):
+            h, edges = self.sample(k, size, _SAMPLE), np.diff(self.walls[k].corners, axis=1).swapaxes(0, 1)
+            area = float(np.linalg.norm(np.cross(*edges), axis=1).sum()) / 2
+            total += layer.count * area * float((h**-2).mean())
+        return total
+
+    def compression(self, k: int, h: float) -> tuple[float, float]:
+        """Return by which factor the prisms of layer `k` shrink cells of size `h` below them, and down to which depth.
+
+        Prisms push the vertices near walls inwards. They leave cells at a greater depth below the walls as they are.
+        """
+        solid, layer = self.free, self.layers[k]
+        depth = INNER_DEPTH * h + DEEPER * layer.thickness
+        rows = np.flatnonzero(np.isin(solid.patch, self._chosen[k]))
+        rows = rows[:: -(-len(rows) // _SAMPLE)]
+        reach = np.full(len(rows), layer.thickness / OF_GAP)
+        middles = solid.surface.corners[rows].mean(axis=1)
+        room = solid.clearance(middles, -solid.normals[rows], reach, solid.patch[rows])
+        thickness = float(np.minimum(layer.thickness, OF_GAP * room).mean())
+        points = solid.lower + scipy.stats.qmc.Halton(3, scramble=False).random(_INSIDE) * solid.extent
+        away2 = self.walls[k].distance2(points[solid.contains(points)])
+        below = np.count_nonzero(away2 < depth**2)
+        share = np.count_nonzero(away2 < thickness**2) / max(below, 1)
+        return max((1 - share) ** (1 / 3), _LEAST_RATIO), depth
+
+    def beyond(self, points: np.ndarray) -> np.ndarray:
+        """Return which of `points` (n, 3) are farther from the walls than the layers are thick, (n,) bool."""
+        beyond = np.ones(len(points), bool)
+        for walls, layer in zip(self.walls, self.layers, strict=True):
+            beyond &= walls.distance2(points) > layer.thickness**2
+        return beyond
 
 
-def as_polygon(domain: Domain) -> tuple[Polygon, np.ndarray]:
+def _as_polygon(domain: Domain) -> tuple[Polygon, np.ndarray]:
     """Return a domain in 2D as a polygon, and the number in `domain` of each of its oriented edges."""
     if domain.outline is not None:
         return domain.outline, domain.outline.oriented.edge_numbers
@@ -233,240 +469,10 @@ def as_polygon(domain: Domain) -> tuple[Polygon, np.ndarray]:
     return Polygon([(a, b), (c, b), (c, d), (a, d)]), np.array([2, 1, 3, 0])
 
 
-def chosen_segments(domain: Domain, layer: Layers) -> np.ndarray:
-    """Return the edges that have `layer`, (k, 2, 2): both ends of each."""
-    polygon, _ = as_polygon(domain)
-    oriented = polygon.oriented
-    return np.stack([oriented.vertices, oriented.ends], axis=1)[_chosen(domain, layer)]
-
-
-def _chosen(domain: Domain, layer: Layers) -> np.ndarray:
-    """Return which of the oriented edges of `as_polygon` have the layer, (k,) bool."""
-    if not isinstance(layer, Layers):
-        raise InputTypeError(f"layers has a {type(layer).__name__}, expected clvoro.Layers")
-    _, numbers = as_polygon(domain)
-    walls = domain.boundaries.select("Layers edges", layer.edges)
-    chosen = np.isin(numbers, walls)
-    if not chosen.any():
-        raise InputError("Layers edges has only edges without length, expected one with a length")
-    return chosen
-
-
-def _chains(domain: Domain, layer: Layers) -> list[Chain]:
-    """Return the chains of edges that have the layer."""
-    polygon, _ = as_polygon(domain)
-    return find_chains(polygon, _chosen(domain, layer))
-
-
 def _distances(points: np.ndarray, segments: np.ndarray) -> np.ndarray:
     """Return the distance of each of the points (n, 2) from the nearest segment, (k, 2, 2)."""
     tree = shapely.STRtree(np.asarray(shapely.linestrings(segments)))
     return tree.query_nearest(shapely.points(points), return_distance=True, all_matches=False)[1]
-
-
-def columns_of(domain: Domain, layer: Layers) -> tuple[np.ndarray, np.ndarray]:
-    """Return feet (c, 2) on the walls and unit normals (c, 2) of all columns of `layer`."""
-    made = [place_columns(chain, layer.width, layer.height) for chain in _chains(domain, layer)]
-    feet, normals = zip(*made, strict=True)
-    return np.concatenate(feet), np.concatenate(normals)
-
-
-def outer_segments(domain: Domain, layer: Layers) -> tuple[np.ndarray, np.ndarray]:
-    """Return the parts (k, 2, 2) of the last row of `layer` between neighboring columns, and their widths (k,).
-
-    Widths are their lengths, but at least `_NEAR` of that between the feet of the columns: in corners columns of two
-    walls come close together. Parts that are outside of the domain, or nearer to another wall, are left out.
-    """
-    polygon, _ = as_polygon(domain)
-    y = float(layer.rows[-1])
-    found, least = [np.empty((0, 2, 2))], [np.empty(0)]
-    for chain in _chains(domain, layer):
-        feet, normals = place_columns(chain, layer.width, layer.height)
-        if chain.closed:
-            feet, normals = (np.concatenate([x, x[:1]]) for x in (feet, normals))
-        row, fan = feet + y * normals, place_fan(chain, layer.width, y)
-        found += [np.stack([part[:-1], part[1:]], axis=1) for part in (row, fan)]
-        least += [_NEAR * np.hypot(*np.diff(feet, axis=0).T), np.zeros(max(len(fan) - 1, 0))]
-    segments = np.concatenate(found)
-    widths = np.maximum(np.hypot(*(segments[:, 1] - segments[:, 0]).T), np.concatenate(least))
-    middles = segments.mean(axis=1)
-    kept = polygon.contains(middles)
-    kept[kept] = _distances(middles[kept], chosen_segments(domain, layer)) >= _OWN * y
-    return segments[kept], widths[kept]
-
-
-def free_domain(domain: Domain, layers: Sequence[Layers]) -> Domain:
-    """Return the part of `domain` beyond the layers, for generators that move; it has the frame of `domain`.
-
-    It begins a third of a width from the last row.
-
-    Raises
-    ------
-    InputError
-        If nothing is left.
-    """
-    distances = [float(layer.rows[-1]) + _APART * layer.width for layer in layers]
-    if domain.outline is None:
-        corners = np.array([domain.lower, domain.upper])
-        for layer, distance in zip(layers, distances, strict=True):
-            for wall in domain.boundaries.select("Layers edges", layer.edges).tolist():
-                axis, end = divmod(wall, 2)
-                moved = (domain.lower, domain.upper)[end][axis] + (-distance if end else distance)
-                corners[end, axis] = (min if end else max)(corners[end, axis], moved)
-        if not (corners[0] < corners[1]).all():
-            raise InputError(_NO_ROOM)
-        free = Box(tuple(corners[0]), tuple(corners[1]), domain.periodic)
-        object.__setattr__(free, "framed_by", domain)
-        return free
-    polygon, _ = as_polygon(domain)
-    # Merged to long lines first: the strips around thousands of short edges would overlap many times.
-    strips = [
-        shapely.line_merge(shapely.union_all(np.asarray(shapely.linestrings(chosen_segments(domain, layer))))).buffer(
-            distance
-        )
-        for layer, distance in zip(layers, distances, strict=True)
-    ]
-    left = polygon.geometry.difference(shapely.union_all(strips))
-    # Where a strip ends beside a corner, an edge as short as round-off may remain.
-    left = shapely.make_valid(shapely.remove_repeated_points(left, _SHORT * float(domain.extent.max())))
-    every = [part for some in shapely.get_parts(left) for part in shapely.get_parts(some)]
-    parts = [part for part in every if part.area > 1e-6 * domain.measure]
-    if not parts:
-        raise InputError(_NO_ROOM)
-    inner = Polygon.from_shapely(shapely.MultiPolygon(parts))
-    inner.framed_by = polygon
-    return inner
-
-
-def check_extruded(domain: Domain, layers: Sequence[Layers]) -> None:
-    """Check layers of prisms in a solid.
-
-    Raises
-    ------
-    InputError
-        If layers are too many, a layer has a spacing, a patch has several layers, layers are thicker than the solid, or
-        patches that meet have layers of different count.
-    InputTypeError
-        If an item is not `Layers`.
-    """
-    count = np.zeros(len(domain.boundaries.index), np.int64)
-    for k, layer in enumerate(layers):
-        if not isinstance(layer, Layers):
-            raise InputTypeError(f"layers has a {type(layer).__name__}, expected clvoro.Layers")
-        if layer.count > _MOST:
-            raise InputError(f"layers[{k}] has count = {layer.count}, expected at most {_MOST}; use fewer layers")
-        if layer.spacing is not None:
-            raise InputError(
-                f"layers[{k}] has spacing = {layer.spacing:g}, expected none in a solid, where prisms are as wide as "
-                "the cells beside them; leave spacing out, and give the size field this value at the wall"
-            )
-        if not layer.thickness < np.linalg.norm(domain.extent) / 2:
-            raise InputError(_NO_ROOM)
-        walls = domain.boundaries.select("Layers edges", layer.edges)
-        if count[walls].any():
-            wall = walls[count[walls] > 0][0]
-            raise InputError(
-                f"layers[{k}] are on {domain.boundary_names[domain.boundary_index[wall]]!r}, which has other layers, "
-                "expected one of them for each patch; name other patches in edges"
-            )
-        count[walls] = layer.count
-    meeting = count[domain.meeting_walls]
-    wrong = np.flatnonzero((meeting > 0).all(axis=1) & (meeting[:, 0] != meeting[:, 1]))
-    if wrong.size:
-        one, other = (
-            domain.boundary_names[domain.boundary_index[wall]] for wall in domain.meeting_walls[wrong[0]].tolist()
-        )
-        a, b = meeting[wrong[0]].tolist()
-        raise InputError(
-            f"layers have count {a} on {one!r} and {b} on {other!r}, which meet at a crease, expected one count; give "
-            f"both count={max(a, b)}, with heights of your choice"
-        )
-
-
-def sample_walls(
-    domain: Domain, layer: Layers, size: Callable[[np.ndarray], np.ndarray], most: int
-) -> tuple[Surface, np.ndarray]:
-    """Return the walls of a solid that have `layer`, and `size` at up to `most` points on them, (k,) float."""
-    walls = cast("Surface", domain.boundary(layer.edges))
-    return walls, np.asarray(size(walls.landmarks(float(domain.extent.min()) / 8, most)), float)
-
-
-def count_prisms(domain: Domain, layers: Sequence[Layers], size: Callable[[np.ndarray], np.ndarray]) -> float:
-    """Return about how many prisms `layers` of a solid have, where wall polygons are as wide as `size` at points."""
-    total = 0.0
-    for layer in layers:
-        walls, h = sample_walls(domain, layer, size, _SAMPLE)
-        area = float(np.linalg.norm(np.cross(*np.diff(walls.corners, axis=1).swapaxes(0, 1)), axis=1).sum()) / 2
-        total += layer.count * area * float((h**-2).mean())
-    return total
-
-
-def compression(domain: Domain, layer: Layers, h: float) -> tuple[float, float]:
-    """Return by which factor the prisms of `layer` shrink the cells of size `h` below them, and down to which depth.
-
-    Prisms push the vertices near walls inwards. They leave cells at a greater depth below the walls as they are.
-    """
-    solid = cast("Solid", domain)
-    depth = INNER_DEPTH * h + DEEPER * layer.thickness
-    rows = np.flatnonzero(np.isin(solid.patch, solid.boundaries.select("Layers edges", layer.edges)))
-    rows = rows[:: -(-len(rows) // _SAMPLE)]
-    reach = np.full(len(rows), layer.thickness / OF_GAP)
-    middles = solid.surface.corners[rows].mean(axis=1)
-    room = solid.clearance(middles, -solid.normals[rows], reach, solid.patch[rows])
-    thickness = float(np.minimum(layer.thickness, OF_GAP * room).mean())
-    points = solid.lower + scipy.stats.qmc.Halton(3, scramble=False).random(_INSIDE) * solid.extent
-    away2 = cast("Surface", solid.boundary(layer.edges)).distance2(points[solid.contains(points)])
-    below = np.count_nonzero(away2 < depth**2)
-    share = np.count_nonzero(away2 < thickness**2) / max(below, 1)
-    return max((1 - share) ** (1 / 3), _LEAST_RATIO), depth
-
-
-def beyond_layers(domain: Domain, layers: Sequence[Layers], points: np.ndarray) -> np.ndarray:
-    """Return which of `points` (n, 3) in a solid are farther from its walls than the layers are thick, (n,) bool."""
-    beyond = np.ones(len(points), bool)
-    for layer in layers:
-        away = cast("Surface", domain.boundary(layer.edges)).distance2(points)
-        beyond &= away > layer.thickness**2
-    return beyond
-
-
-def apart_from(points: np.ndarray, rows: np.ndarray, free: Domain) -> np.ndarray:
-    """Return for each of `points` (n, 2) whether it lies in the `free` domain and differs from all `rows` (k, 2)."""
-    return np.asarray(free.contains(points) & (scipy.spatial.KDTree(rows).query(points)[0] > 0))
-
-
-def check_gaps(domain: Domain, layers: Sequence[Layers]) -> None:
-    """Refuse layers that are thicker than the gap between two walls along much of their length.
-
-    In a narrow place, where layers of two walls overlap, each row is kept for its nearest wall. Layers that reach
-    beyond the middle of a long gap give spikes.
-
-    Raises
-    ------
-    InputError
-        With the place of a narrow gap, and the largest thickness that fits there.
-    """
-    polygon, _ = as_polygon(domain)
-    begin, end = polygon.oriented.vertices, polygon.oriented.ends
-    thickness = np.zeros(len(begin))
-    for layer in layers:
-        chosen = _chosen(domain, layer)
-        thickness[chosen] = np.maximum(thickness[chosen], layer.rows[-1])
-    for k, layer in enumerate(layers):
-        feet, normals = columns_of(domain, layer)
-        gaps, walls = _opposite(feet, normals, begin, end)
-        needed = float(layer.rows[-1]) + np.where(walls >= 0, thickness[walls], 0.0)
-        tight = needed > gaps
-        if tight.mean() <= _TIGHT:
-            continue
-        # In sharp corners columns are in ever narrower gaps: a few of the narrowest are passed over.
-        worst = int(np.argsort(gaps / needed, kind="stable")[int(_TIGHT / 2 * len(gaps))])
-        fits = _FILLED * layer.thickness * gaps[worst] / needed[worst]
-        raise InputError(
-            f"layers[{k}] are {layer.thickness:.3g} thick, and the gap at {format_point(feet[worst])} is "
-            f"{gaps[worst]:.3g} wide{', with layers on both sides' if thickness[walls[worst]] else ''}, expected a "
-            f"thickness of at most {fits:.3g}; use fewer or thinner layers, or leave out these edges"
-        )
 
 
 def _opposite(

@@ -1,9 +1,9 @@
-"""Distances to shapes, and sizes that grow with them, also from boundary layers."""
+"""Distances to shapes, and sizes that grow with them."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from functools import cached_property
 from numbers import Real
 from typing import TYPE_CHECKING, Any
@@ -13,7 +13,6 @@ import shapely
 
 from ..errors import InputError, InputTypeError
 from ..geometry import curves
-from ..geometry.boundary_layers import Layers, chosen_segments, compression, outer_segments, sample_walls
 from ..geometry.bvh import Tree
 from ..geometry.domain import Domain
 from ..geometry.lines.lines import Lines
@@ -21,7 +20,7 @@ from ..geometry.shapes import Circle, Edges, Polyline, Segment, shapes_of
 from ..geometry.surface import Surface
 from ..geometry.triangles import segment_distance2
 from .arguments import check_positive, check_slope
-from .field import Field, as_field, maximum, minimum
+from .field import Field
 
 if TYPE_CHECKING:
     from .codegen import CodeWriter
@@ -264,56 +263,3 @@ def _item_boxes(begin: np.ndarray, end: np.ndarray, radius: np.ndarray) -> tuple
     # box of a circle by an ulp, so boxes are widened.
     wide = (np.maximum(radius, 0) * (1 + 4 * np.finfo(radius.dtype).eps))[:, None]
     return np.minimum(begin, end) - wide, np.maximum(begin, end) + wide
-
-
-_WALLS, _COMPRESSED, _FADING = 1024, 0.995, 0.4
-"""Points on walls at which sizes are averaged; least factor on sizes that is neglected; share of the depth over which
-the factor grows to 1."""
-_GROWTH = 1.2
-"""Growth of sizes beyond layers of constant height."""
-_CLASS = 1.4
-"""Columns whose widths differ by less than this factor have one distance field."""
-
-
-def limit_beside_layers(size: object, domain: Domain, layers: Sequence[Layers]) -> Field:
-    """Return `size`, limited to sizes that grow into the domain from the widths of the columns at the last row."""
-    field = as_field(size)
-    for layer in layers:
-        slope = math.log(layer.growth if layer.growth > 1 else _GROWTH)
-        segments, widths = outer_segments(domain, layer)
-        if not len(segments):
-            segments = chosen_segments(domain, layer)
-            widths = np.full(len(segments), layer.width)
-        field = _limited(field, segments, widths, layer.width, slope)
-    return field
-
-
-def before_layers(field: Field, domain: Domain, layers: Sequence[Layers]) -> Field:
-    """Return the sizes of cells of a solid before layers of prisms compress them to the sizes of `field`."""
-    for layer in layers:
-        walls, h = sample_walls(domain, layer, field, _WALLS)
-        ratio, depth = compression(domain, layer, float(h.mean()))
-        if ratio < _COMPRESSED:
-            # The ratio near walls, and 1 beyond the depth.
-            slope = (1 - ratio) / (_FADING * depth)
-            begin = ratio - (1 - 0.5 * _FADING) * depth * slope
-            ramp = Distance(walls, h_min=begin, slope=slope, h_max=1.0)
-            field = field / maximum(ramp, ratio)
-    return field
-
-
-def limit_beside_borders(field: Field, segments: np.ndarray, sizes: np.ndarray) -> Field:
-    """Return `field`, limited to `sizes` (k,) at `segments` (k, 2, d), where borders are near to each other."""
-    return _limited(field, segments, sizes, 1.0, math.log(_GROWTH))
-
-
-def _limited(field: Field, segments: np.ndarray, widths: np.ndarray, width: float, slope: float) -> Field:
-    """Return `field`, limited to sizes that grow from the `widths` (k,) at `segments` (k, 2, 2).
-
-    Those of one class, counted from `width`, have one distance field.
-    """
-    classes = np.floor(np.log(widths / width) / math.log(_CLASS) + 0.5)
-    for one in np.unique(classes):
-        row = Edges(*np.moveaxis(segments[classes == one], 1, 0))
-        field = minimum(field, Distance(row, h_min=float(widths[classes == one].mean()), slope=slope))
-    return field

@@ -15,6 +15,7 @@ from clvoro.adaptation.diagnostics import warn_of_narrow_parts
 from clvoro.adaptation.layers import layer_mismatches
 from clvoro.cli import command as cli
 from clvoro.errors import CoarseSizeWarning, MismatchWarning, SizeErrorWarning
+from clvoro.geometry.boundary_layers import LayerRows
 
 BOX = clvoro.Box((0, 0), (2, 1))
 CUBE = clvoro.Box((0, 0, 0), (1, 1, 1))
@@ -174,7 +175,7 @@ def test_warnings_of_layers(layer, size, message, domain):
     # The field is coarse far away: what counts is beside the layers.
     field = sizing.Distance(sizing.Segment((0, 0), (2, 0)), h_min=size, slope=0.05)
     edges = (2,) if domain is BOX else (0,)
-    found = layer_mismatches("layers[0]", clvoro.Layers(**layer, edges=edges), field, domain)
+    found = layer_mismatches(LayerRows(domain, [clvoro.Layers(**layer, edges=edges)]), field)
     assert len(found) == (message is not None)
     assert message is None or message in found[0]
 

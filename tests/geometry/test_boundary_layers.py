@@ -8,18 +8,10 @@ import pytest
 import shapely
 
 import clvoro
+from clvoro.adaptation.options import Options
 from clvoro.errors import InputError, InputTypeError
 from clvoro.finite_volumes.prisms import cell_loops
-from clvoro.geometry.boundary_layers import (
-    Layers,
-    check_gaps,
-    chosen_segments,
-    columns_of,
-    count_rows,
-    free_domain,
-    outer_segments,
-    place_layers,
-)
+from clvoro.geometry.boundary_layers import LayerRows, Layers
 from tests.reference import shores
 
 BOX = clvoro.Box((0, 0), (2, 1))
@@ -40,7 +32,7 @@ def test_bisectors_are_the_borders_of_layers():
 def test_layers_of_a_straight_wall_are_rectangles(adapter):
     layers = Layers(0.02, count=2, growth=1.5, edges=[2])
     result = adapter.run(BOX, 0.1, layers=layers, effort="fast")
-    rows = place_layers(BOX, [layers])
+    rows = LayerRows(BOX, [layers]).points
     n, d = len(rows), result.diagram
     # They come first and have not moved, up to round-off of the device's coordinates.
     assert np.abs(result.points[:n] - rows).max() < 1e-14
@@ -81,7 +73,7 @@ RAGGED = clvoro.Polygon(
 def test_corners_of_the_wall_are_corners_of_cells(adapter, domain, edges, spacing):
     """No face on the wall is a sliver that a corner of the wall cuts off."""
     layers = Layers(0.4 * spacing, count=2, spacing=spacing, edges=edges)
-    rows = place_layers(domain, [layers])
+    rows = LayerRows(domain, [layers]).points
     diagram = adapter.diagram(domain, rows)
     owners = np.repeat(np.arange(len(rows)), np.diff(diagram.neighbor_starts))
     walls = -1 - diagram.neighbors
@@ -96,7 +88,7 @@ def test_corners_of_the_wall_are_corners_of_cells(adapter, domain, edges, spacin
     assert lengths.min() > (0.4 if two_edges else 0.7) * spacing
     assert lengths.max() < 1.3 * spacing
     assert lengths.sum() == pytest.approx(
-        sum(np.linalg.norm(b - a) for a, b in chosen_segments(domain, layers)), rel=1e-12
+        sum(np.linalg.norm(b - a) for a, b in LayerRows(domain, [layers]).segments(0)), rel=1e-12
     )
 
 
@@ -108,7 +100,7 @@ def test_layers_of_a_periodic_channel_go_through_the_seam(adapter, axis):
     channel = clvoro.Box((0, 0), shape, periodic=(axis == 0, axis == 1))
     layers = Layers(0.02, count=3, growth=1.2)
     result = adapter.run(channel, 0.1, layers=layers, effort="fast")
-    rows, d = place_layers(channel, [layers]), result.diagram
+    rows, d = LayerRows(channel, [layers]).points, result.diagram
     columns = round(2 / layers.width)
     assert len(rows) == 2 * 4 * columns
     moved = result.points[: len(rows)] - rows
@@ -137,7 +129,7 @@ def test_sizes_grow_from_the_layers(adapter):
     # Sizes depend on the distance to edges, whose middles are inside the circle.
     expected = layers.width + np.log(1.2) * distance[beyond]
     assert result.target_size[beyond] == pytest.approx(expected, abs=1e-3)
-    n = len(place_layers(CHANNEL, [layers]))
+    n = len(LayerRows(CHANNEL, [layers]).points)
     assert np.abs(result.size_error[n:]).mean() < 0.02
     assert CHANNEL.contains(result.points).all()
     assert result.diagram.volumes.sum() == pytest.approx(CHANNEL.measure, rel=1e-12)
@@ -151,7 +143,8 @@ def test_no_method_moves_generators_of_layers(adapter, method):
         {"max_steps": 8} if method != "exact" else {"effort": "fast", "options": clvoro.MultilevelOptions(levels=1)}
     )
     result = adapter.run(CHANNEL, 0.1, layers=layers, method=method, **options)
-    rows, free = place_layers(CHANNEL, [layers]), free_domain(CHANNEL, [layers])
+    made = LayerRows(CHANNEL, [layers])
+    rows, free = made.points, made.free
     assert np.abs(result.points[: len(rows)] - rows).max() < 1e-14
     assert free.contains(result.points[len(rows) :]).all()
 
@@ -159,7 +152,7 @@ def test_no_method_moves_generators_of_layers(adapter, method):
 def test_layers_in_corners_and_gaps_belong_to_the_nearest_wall():
     comb = clvoro.Polygon([(0, 0), (3, 0), (3, 1), (2, 1), (2, 0.15), (1, 0.15), (1, 1), (0, 1)])
     layers = Layers(0.02, count=3, growth=1.2)
-    rows = place_layers(comb, [layers])
+    rows = LayerRows(comb, [layers]).points
     assert comb.contains(rows).all()
     near = comb.boundary_distance(rows)
     # Each is on a row, counted from the nearest wall.
@@ -180,8 +173,8 @@ def test_columns_are_narrow_where_the_wall_is_curved_and_beside_sharp_edges():
     wing = clvoro.curves.naca("0012", name="wing")
     domain = clvoro.Polygon(clvoro.curves.circle((0.5, 0), 6), [wing])
     layers = Layers(1e-3, count=3, growth=1.3, spacing=0.05, edges="wing")
-    segments, _ = outer_segments(domain, layers)
-    feet, normals = columns_of(domain, layers)
+    made = LayerRows(domain, [layers])
+    (segments, _), (feet, normals) = made.outer_segments(0), made.columns(0)
     gaps = np.hypot(*np.diff(feet, axis=0).T)
     turns = np.arccos(np.clip((normals[1:] * normals[:-1]).sum(axis=1), -1, 1))
     assert (gaps * turns / 8).max() < 1.2 * 0.25 * layers.height  # w^2 / (8 r), and r is w / turn
@@ -199,7 +192,7 @@ def test_widths_of_columns_change_gradually_where_a_closed_wall_begins(start):
     """An ellipse, narrow at its tips, begins in a tip, beside it and on its flat side."""
     body = clvoro.curves.ellipse((0, 0), (1, 0.03), start=start, end=start + 360, name="body")
     domain = clvoro.Polygon(clvoro.curves.circle((0, 0), 6), [body])
-    feet, _ = columns_of(domain, Layers(1e-3, count=3, spacing=0.1, edges="body"))
+    feet, _ = LayerRows(domain, [Layers(1e-3, count=3, spacing=0.1, edges="body")]).columns(0)
     gaps = np.hypot(*(np.roll(feet, -1, axis=0) - feet).T)
     assert gaps.min() < 0.004
     assert gaps.max() == pytest.approx(0.1, rel=0.02)
@@ -256,7 +249,7 @@ def test_sizes_are_met_where_columns_of_two_walls_come_close(adapter):
     """In this corner they are 4.5 apart. Sizes beyond had that limit once, and |e| was up to 75."""
     domain = clvoro.Polygon([(600, 2100), (-200, 900), (0, 0), (700, 900)])
     layers = clvoro.Layers(8, 4, 1.2, spacing=25, edges=(0, 1))
-    segments, widths = outer_segments(domain, layers)
+    segments, widths = LayerRows(domain, [layers]).outer_segments(0)
     lengths = np.hypot(*(segments[:, 1] - segments[:, 0]).T)
     assert lengths.min() < 5 < 0.5 * layers.width < widths.min()
     result = adapter.run(domain, 60.0, layers=layers, seed=3)
@@ -293,10 +286,10 @@ def test_runs_with_layers_resume_to_the_same_bits(adapter, tmp_path):
         (lambda: Layers(0), "height"),
         (lambda: Layers(0.1, count=0), "count"),
         (lambda: Layers(0.1, growth=0.9), "growth"),
-        (lambda: place_layers(BOX, [Layers(0.1, edges=[4])]), "has side 4, expected numbers from 0 to 3"),
-        (lambda: place_layers(BOX, [Layers(0.1, edges=[])]), "empty"),
-        (lambda: free_domain(BOX, [Layers(0.4, edges=[2, 3])]), "no room"),
-        (lambda: free_domain(CHANNEL, [Layers(0.4)]), "no room"),
+        (lambda: LayerRows(BOX, [Layers(0.1, edges=[4])]).points, "has side 4, expected numbers from 0 to 3"),
+        (lambda: LayerRows(BOX, [Layers(0.1, edges=[])]).points, "empty"),
+        (lambda: LayerRows(BOX, [Layers(0.4, edges=[2, 3])]).free, "no room"),
+        (lambda: LayerRows(CHANNEL, [Layers(0.4)]).free, "no room"),
     ],
 )
 def test_impossible_layers_are_refused(make, words):
@@ -339,7 +332,7 @@ def test_thickness_is_that_of_all_heights(growth):
 @pytest.mark.parametrize(("domain", "edges"), [(BOX, None), (CHANNEL, None), (CHANNEL, range(4))])
 def test_the_count_bounds_the_number_of_generators(domain, edges):
     layers = Layers(0.02, count=3, edges=edges)
-    count, placed = count_rows(domain, [layers]), len(place_layers(domain, [layers]))
+    count, placed = LayerRows(domain, [layers]).count(), len(LayerRows(domain, [layers]).points)
     assert 0.8 * count < placed <= count
 
 
@@ -350,16 +343,16 @@ def test_strips_may_end_beside_corners(adapter, beside):
     layer = clvoro.Layers(0.05, count=1, spacing=0.1, edges=[0])
     reach = layer.rows[-1] + 0.03
     shore = clvoro.Polygon([(0, 0), (1, 0), (1, 1), (0, 1), (0, reach + beside)])
-    assert free_domain(shore, [layer]).lower[1] == pytest.approx(reach, abs=1e-9)
+    assert LayerRows(shore, [layer]).free.lower[1] == pytest.approx(reach, abs=1e-9)
     assert adapter.run(shore, 0.1, layers=layer, method="lloyd", max_steps=1).check()
 
 
 def test_domains_without_walls_in_2d_are_refused():
     for domain in (clvoro.Box((0, 0, 0), (1, 1, 1)), clvoro.Box((0, 0), (1, 1), periodic=True)):
         with pytest.raises(InputTypeError, match="walls"):
-            place_layers(domain, [Layers(0.1)])
+            LayerRows(domain, [Layers(0.1)])
     with pytest.raises(InputTypeError, match="Layers"):
-        place_layers(BOX, [0.1])
+        Options(layers=[0.1])
 
 
 @pytest.mark.slow
@@ -374,8 +367,8 @@ def test_new_generators_keep_away_from_layers_around_corners(ctx, dtype):
             star, 0.03, layers=layer, options=clvoro.MultilevelOptions(levels=1), effort="fast", max_steps=20, seed=1
         )
         result.check().demand()
-        others = result.points[len(place_layers(star, [layer])) :]
-        away = shapely.distance(free_domain(star, [layer]).geometry, shapely.points(others))
+        others = result.points[len(LayerRows(star, [layer]).points) :]
+        away = shapely.distance(LayerRows(star, [layer]).free.geometry, shapely.points(others))
         assert away.max() <= 16 * np.finfo(dtype).eps
         assert (result.history["inserted"] > 0).sum() >= 2, "by refinement, and to meet the count"
 
@@ -397,8 +390,9 @@ def test_layers_thicker_than_their_gap_are_refused_with_a_thickness_that_fits(ct
     with pytest.raises(
         InputError, match=r"the gap at \(1\.\d*, 0\.1\) is 0\.1 wide, with layers on both sides"
     ) as raised:
-        check_gaps(throat, [Layers(0.01, count=6)])
-    check_gaps(throat, [Layers(float(re.search("at most ([0-9.]+)", str(raised.value))[1]) / 6, count=6, spacing=0.01)])
+        LayerRows(throat, [Layers(0.01, count=6)]).check_gaps()
+    fits = float(re.search("at most ([0-9.]+)", str(raised.value))[1])
+    LayerRows(throat, [Layers(fits / 6, count=6, spacing=0.01)]).check_gaps()
 
 
 def test_a_default_width_below_the_size_field_is_said(ctx):

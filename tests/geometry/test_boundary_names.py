@@ -12,7 +12,7 @@ import clvoro
 from clvoro import sizing
 from clvoro.cli.cases import Case
 from clvoro.errors import InputError, InputTypeError
-from clvoro.geometry.boundary_layers import chosen_segments, place_layers
+from clvoro.geometry.boundary_layers import LayerRows
 from clvoro.io.contents import Contents
 from clvoro.io.vtu import cell_data
 from tests.io import test_foam
@@ -101,13 +101,13 @@ def test_boundary_layers_and_distances_take_names_and_numbers(meshed) -> None:
         h = sizing.Distance(curve, 0.1, slope=0.5)(x)
         assert h == pytest.approx(0.1 + 0.5 * shapely.distance(shape, shapely.points(x)), rel=1e-14)
         layer = clvoro.Layers(0.01, edges=selection)
-        lines = shapely.linestrings(chosen_segments(domain, layer))
+        lines = shapely.linestrings(LayerRows(domain, [layer]).segments(0))
         assert shapely.union_all(lines).equals(shape)
 
 
 def test_layers_stand_on_the_named_walls(meshed) -> None:
     domain, layers = meshed[2].diagram.domain, clvoro.Layers(0.02, count=2, edges="island")
-    away = shapely.distance(shapely.Polygon(HOLES[0]), shapely.points(place_layers(domain, [layers])))
+    away = shapely.distance(shapely.Polygon(HOLES[0]), shapely.points(LayerRows(domain, [layers]).points))
     assert len(away) > 100
     assert away.max() < layers.rows[-1] * (1 + 1e-12)
 
@@ -220,7 +220,7 @@ def test_names_of_boxes(adapter_of_module, tmp_path) -> None:
         assert len(side.triangles) == 2
         assert (side.vertices[side.triangles][..., axis] == end * (axis + 1)).all()
     assert clvoro.Layers(0.1, edges="walls").edges == ("walls",)
-    ends = chosen_segments(box, clvoro.Layers(0.1, edges="walls"))
+    ends = LayerRows(box, [clvoro.Layers(0.1, edges="walls")]).segments(0)
     assert sorted(ends[:, :, 1].mean(axis=1).tolist()) == [0, 1]
     result = adapter_of_module.run(box, 0.2, method="lloyd", max_steps=1)
     result.to_openfoam(tmp_path / "polyMesh", patches={"outlet": "xMax"})
@@ -366,7 +366,7 @@ def test_cases_name_boundaries(tmp_path, back) -> None:
         x = np.array([(0.5, 0.25)])
         assert case.size_field()(x) == pytest.approx(0.1 + 0.5 * (0.75 if back else 0.25))
         (layer,) = case.run_arguments()["layers"]
-        ends = chosen_segments(case.domain, layer)
+        ends = LayerRows(case.domain, [layer]).segments(0)
         assert sorted(ends[..., 0].mean(axis=1).tolist()) == [0, 2]
     case = Case.from_toml(CASE.format(domain="lower = [0, 0]\nupper = [2, 1]", shore="'yMin'"), "c")
     assert case.domain.boundary_names == ("shore", "inlet", "xMin", "xMax")

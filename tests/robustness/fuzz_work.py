@@ -13,7 +13,7 @@ import shapely
 
 import clvoro
 from clvoro.errors import InputError
-from clvoro.geometry.boundary_layers import count_rows, free_domain, place_layers
+from clvoro.geometry.boundary_layers import LayerRows
 from clvoro.io.vtu_read import load_vtu
 from tests.robustness.fuzz_inputs import around, placed, some_box, some_layers, some_periodic_box, some_polygon
 from tests.robustness.fuzz_judge import Wrong, adapter, demand, diagram_by, run_by, some_real
@@ -96,8 +96,8 @@ def few_layers(rng: np.random.Generator, domain: Any, wild: bool) -> list[clvoro
         if wild:
             break
         with contextlib.suppress(InputError):
-            if count_rows(domain, layers) <= MOST_ROWS:
-                free_domain(domain, layers)
+            made = LayerRows(domain, layers)
+            if made.count() <= MOST_ROWS and made.free:
                 break
     return layers
 
@@ -111,7 +111,8 @@ def try_layers(rng: np.random.Generator) -> str:
         if not wild and all(domain.periodic):  # layers go along walls
             domain = clvoro.Box(domain.lower, domain.upper, periodic=(True, False))
     layers, real = few_layers(rng, domain, wild), some_real(rng)
-    if MOST_ROWS < count_rows(domain, layers) < 1e9:  # too long for a test
+    made = LayerRows(domain, layers)
+    if MOST_ROWS < made.count() < 1e9:  # too long for a test
         return "left out"
     options = some_options(rng, domain, real, wild)
     options["effort"] = "fast"
@@ -120,7 +121,7 @@ def try_layers(rng: np.random.Generator) -> str:
         if options.get("method") in ("mmpde", "monge-ampere"):
             del options["method"]  # starts from a lattice, without layers
     result = adapter(real).run(domain, some_size(rng, domain, wild), layers=layers, **options)
-    rows, free = place_layers(domain, layers), free_domain(domain, layers)
+    rows, free = made.points, made.free
     # Coordinates of the device are relative to the frame, those of the host to 0.
     slack = 8 * np.finfo(real).eps * domain.extent.max()
     slack += 4 * sum(np.spacing(np.abs(corner).max()) for corner in (domain.upper, domain.lower))
