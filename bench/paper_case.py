@@ -5,8 +5,7 @@ starts, and prints for each claim of the paper what was measured and whether it 
 
     python bench/paper_case.py [--seeds 3] [--steps 100] [--k 1] [--device NAME] [--dtype float32] [--json]
 
-Exits with 1 if a claim does not hold. `--markdown` prints the tables of RESULTS.md, and
-`--pictures DIR` writes the pictures of the first start.
+Exits with 1 if a claim does not hold. `clvoro run paper` draws the pictures.
 """
 
 from __future__ import annotations
@@ -15,7 +14,6 @@ import json
 import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from _common import FIRST_SEED, make_adapter, parser
@@ -225,30 +223,8 @@ def judge(runs: list[dict[str, Result]]) -> list[dict]:
     return verdicts
 
 
-def print_table(runs: list[dict[str, Result]], verdicts: list[dict]) -> None:
-    print(
-        f"{'start':>5} {'method':8} {'cells':>6} {'steps':>5} {'mean |e|':>9} {'max |e|':>8} "
-        f"{'mean Q':>7} {'min Q':>6} {'seconds':>8}"
-    )
-    for number, results in enumerate(runs, start=1):
-        for method, result in results.items():
-            s = summary(result)
-            print(
-                f"{number:5} {method:8} {s['cells']:6} {s['steps']:5} {s['mean_error']:9.4f} "
-                f"{s['max_error']:8.3f} {s['mean_quality']:7.4f} {s['min_quality']:6.3f} "
-                f"{s['seconds']:8.2f}"
-            )
-    for number, verdict in enumerate(verdicts, start=1):
-        good = sum(verdict["holds"])
-        word = "holds" if good == len(runs) else f"holds for {good} of {len(runs)} starts"
-        print(f"\n{number}. {verdict['claim']}: {word}\n   (asked: {verdict['criterion']})")
-        for name in verdict["measured"][0]:
-            values = [m[name] for m in verdict["measured"]]
-            print(f"   {name:24} " + "  ".join(f"{v:8.4g}" for v in values))
-
-
-def print_markdown(runs: list[dict[str, Result]], verdicts: list[dict]) -> None:
-    """Print the tables of RESULTS.md: ranges over the starts."""
+def print_tables(runs: list[dict[str, Result]], verdicts: list[dict]) -> None:
+    """Print ranges over the starts, and for each claim what was measured."""
 
     def span(values: list[float], form: str = ".3g") -> str:
         low, high = format(min(values), form), format(max(values), form)
@@ -274,8 +250,6 @@ def main() -> int:
     options.add_argument("--seeds", type=int, default=3, metavar="N", help="random starts (3)")
     options.add_argument("--steps", type=int, default=100, help="steps per run (100)")
     options.add_argument("--k", type=float, default=1.0, help="the paper's k (1)")
-    options.add_argument("--markdown", action="store_true", help="print the tables of RESULTS.md")
-    options.add_argument("--pictures", type=Path, metavar="DIR", help="write the report here")
     arguments = options.parse_args()
 
     adapter = make_adapter(arguments)
@@ -285,18 +259,9 @@ def main() -> int:
         figures = [{m: summary(r) for m, r in results.items()} for results in runs]
         device = adapter.ctx.devices[0].name.strip()
         print(json.dumps({"device": device, "runs": figures, "claims": verdicts}))
-    elif arguments.markdown:
-        print_markdown(runs, verdicts)
     else:
-        print(f"{adapter.ctx.devices[0].name.strip()}, k = {arguments.k:g}")
-        print_table(runs, verdicts)
-    if arguments.pictures:
-        from clvoro.plotting import write_report
-
-        case = load_case("paper")
-        points = runs[0]["coupled"].initial.points
-        initial = adapter.run(case.domain, case.size_field(), points=points, method="lloyd", max_steps=0)
-        write_report(runs[0], arguments.pictures, initial=initial, size=case.size_field(), title=case.title)
+        print(f"{adapter.ctx.devices[0].name.strip()}, k = {arguments.k:g}\n")
+        print_tables(runs, verdicts)
     return 0 if all(all(v["holds"]) for v in verdicts) else 1
 
 

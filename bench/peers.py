@@ -16,9 +16,6 @@ Volumes are compared with those of `--samples` cells, which SciPy intersects fro
 is the share of these that differ by above 1e-6, "worst" their largest relative difference. "sum" is the sum of all
 volumes less that of the domain. peclet-voro has periodic boxes alone, and is compared with such cells. VTK cuts at
 a box of its own around the points, so that cells off the walls are compared, and no sum.
-
-JIGSAW makes points of its own: its rows give the time of a mesh with about as many vertices of one size ("uniform"),
-where its program is on the PATH.
 """
 
 from __future__ import annotations
@@ -30,7 +27,6 @@ import json
 import math
 import os
 import resource
-import shutil
 import subprocess
 import sys
 import tempfile
@@ -191,36 +187,6 @@ def with_pysdot(points: Array, _: argparse.Namespace) -> Made:
     return lambda: module.PowerDiagram(points, weights, domain).integrals(), np.array
 
 
-def with_jigsaw(points: Array, options: argparse.Namespace) -> Made:
-    """Return a call that meshes the unit square or cube with about as many vertices, without volumes."""
-    if not (program := shutil.which("jigsaw")):
-        raise ImportError("jigsaw is not on the PATH")
-    n, dim = points.shape
-    corners = list(itertools.product((0, 1), repeat=dim))
-    parts = [(0, 1), (1, 3), (3, 2), (2, 0)]
-    if dim == 3:
-        parts = [(0, 1, 3), (0, 3, 2), (4, 6, 7), (4, 7, 5), (0, 4, 5), (0, 5, 1)]
-        parts += [(2, 3, 7), (2, 7, 6), (0, 2, 6), (0, 6, 4), (1, 5, 7), (1, 7, 3)]
-    kind = "EDGE2" if dim == 2 else "TRIA3"
-    h = math.sqrt(2 / (math.sqrt(3) * n)) if dim == 2 else (math.sqrt(2) / n) ** (1 / 3)
-    lines = ["MSHID=3;EUCLIDEAN-MESH", f"NDIMS={dim}", f"POINT={len(corners)}"]
-    lines += [";".join(map(str, (*corner, 0))) for corner in corners]
-    lines += [f"{kind}={len(parts)}", *(";".join(map(str, (*part, 0))) for part in parts)]
-    folder = Path(tempfile.mkdtemp(dir=options.folder))
-    (folder / "box.msh").write_text("\n".join(lines) + "\n")
-    settings = {"GEOM_FILE": folder / "box.msh", "MESH_FILE": folder / "mesh.msh", "HFUN_SCAL": "ABSOLUTE"}
-    settings |= {"HFUN_HMAX": h, "MESH_DIMS": dim, "GEOM_FEAT": "TRUE", "VERBOSITY": 0}
-    (folder / "box.jig").write_text("".join(f"{key} = {value}\n" for key, value in settings.items()))
-
-    def made() -> Array:
-        subprocess.run([program, folder / "box.jig"], check=True, stdout=subprocess.DEVNULL)
-        with (folder / "mesh.msh").open() as mesh:
-            vertices = next(int(line.split("=")[1]) for line in mesh if line.lower().startswith("point"))
-        return np.full(vertices, np.nan)
-
-    return made, np.asarray
-
-
 class Peer(NamedTuple):
     """Another package: what makes its call, the dimensions that it has, its boundaries."""
 
@@ -228,7 +194,6 @@ class Peer(NamedTuple):
     dims: tuple[int, ...] = (2, 3)
     periodic: bool = False
     whole: bool = True
-    volumes: bool = True
 
 
 PEERS = {
@@ -239,7 +204,6 @@ PEERS = {
     "VTK": Peer(with_vtk, whole=False),
     "geogram": Peer(with_geogram),
     "pysdot": Peer(with_pysdot),
-    "JIGSAW": Peer(with_jigsaw, volumes=False),
 }
 
 
@@ -351,7 +315,7 @@ def measure(options: argparse.Namespace, report: Report) -> None:
         truths: dict[bool, Truth] = {}
         for name in options.peers:
             peer = PEERS[name]
-            if dim not in peer.dims or (peer.periodic and dim == 2) or (which != "uniform" and not peer.volumes):
+            if dim not in peer.dims or (peer.periodic and dim == 2):
                 continue
             record: dict[str, Any] = {"peer": name, "dim": dim, "cells": n, "set": which}
             with tempfile.TemporaryDirectory() as made:
@@ -359,9 +323,7 @@ def measure(options: argparse.Namespace, report: Report) -> None:
                 record |= launched(name, which, n, dim, options, folder)
                 if (folder / "volumes.npy").exists():
                     volumes = np.load(folder / "volumes.npy")
-                    if not peer.volumes:
-                        record |= {"cells": len(volumes), "note": "own points"}
-                    elif len(volumes) != n:
+                    if len(volumes) != n:
                         record["note"] = f"wrong: {len(volumes)} volumes"
                     else:
                         if peer.periodic not in truths:

@@ -1,4 +1,4 @@
-"""One step of a run by its parts: displacement, motion, update of the diagram, evaluation; and the machine's limits.
+"""One step of a run by its parts: displacement, motion, update of the diagram, evaluation.
 
     python bench/step.py [--sizes 1e5,1e6] [--kinds weighted,glide,polish] [--repeat 7]
                          [--processor-time] [--device NAME] [--dtype float32] [--json]
@@ -10,12 +10,6 @@ idle queue to an idle queue, in milliseconds: "displace" finds the displacement 
 device's time of its linear solver), "diagram" updates the tessellation, "rest" moves, evaluates h,
 error, quality and their sums. "diagram M/s" is cells per second of the updated diagram with all its measures,
 "to host" the bytes that the host reads. "cold" makes the same diagram from nothing, from binning on.
-
-The second table holds kernels against the machine: bytes that must move per cell (each array that
-the kernel needs, once) over what copying moves per second, and operations that must be done per
-cell over what independent multiply-adds reach, each as a share of the time measured; the larger
-says how near the kernel is to its limit. Operations are counted from the source for a cell of six
-faces, a division as four.
 """
 
 from __future__ import annotations
@@ -28,7 +22,7 @@ from typing import Any
 
 import numpy as np
 import pyopencl as cl
-from _common import BOX, Report, clock_of, counts, heading, make_adapter, markdown, names, parser, test_field
+from _common import BOX, Report, clock_of, counts, heading, make_adapter, names, parser, test_field
 
 import clvoro
 from clvoro.adaptation.methods import ProjectedMethod, WeightedMethod
@@ -57,60 +51,6 @@ def kinds() -> dict[str, Callable[[], Method]]:
 
 
 KINDS = kinds()
-
-NEEDS = {
-    # kernel: (reals, integers, operations) per cell of six faces
-    "incremental.check_rows": (2, 6 + 3, 6 * 40),
-    "cells.match_polygon_faces": (0, 4, 0),
-    "cells.measure_cells": (2 + 1 + 2 + 3, 6 + 6 + 4 + 6 + 12, 6 * 75 + 40),
-    "metric.evaluate_metric": (1 + 2 + 3 + 1 + 4 + 2 + 2 + 2, 1 + 6 + 6 + 1 + 1, 60 + 6 * 12),
-    "density.fit_gradient": (2 + 1 + 2 + 3 + 2 + 2, 6 + 1, 6 * 20 + 50),
-    "quality_descent.descend_quality": (2 + 4 + 2, 6 + 1 + 6 + 12, 6 * 60),
-    "motion.move_generators": (2 + 2 + 1 + 2 + 2 + 2, 0, 20),
-    "poisson.assemble_laplacian": (2 + 1, 6 + 1 + 6 + 12, 3 * 20),
-    "volume_projection.assemble_projection": (2 + 1 + 2 + 1 + 2, 6 + 1 + 6 + 12 + 12 + 12, 6 * 40),
-    "volume_projection.update_projection_direction": (0, 6 + 1 + 12 + 2 + 1 + 2 + 2, 6 * 4),
-    "volume_projection.update_projection": (0, 6 + 1 + 12 + 2 + 1 + 2 + 2, 6 * 4),
-}
-"""What each kernel must at least transfer and compute. Numbers in single precision count as integers."""
-
-ITERATED = ("update_projection_direction", "update_projection")
-"""Kernels that are enqueued for more iterations than are needed. Only calls of the needed ones count."""
-
-PEAK = """
-kernel void multiply_add(const int size, const REAL a, const REAL b, global REAL *out)
-{
-    const int i = get_global_id(0);
-    VEC x[8];
-    for (int k = 0; k < 8; ++k)
-        x[k] = (VEC)(i + k);
-    for (int n = 0; n < 4096; ++n)
-        for (int k = 0; k < 8; ++k)
-            x[k] = fma(x[k], (VEC)(a), (VEC)(b));
-    VEC sum = 0;
-    for (int k = 0; k < 8; ++k)
-        sum += x[k];
-    if (i < size)
-        out[i] = sum.s0 + sum.s1 + sum.s2 + sum.s3 + sum.s4 + sum.s5 + sum.s6 + sum.s7;
-}
-"""
-
-
-def peak_operations(adapter: clvoro.Adapter) -> float:
-    """Operations per second of independent multiply-adds, in vectors of eight; a multiply-add is two."""
-    real = "double" if adapter.dtype == np.float64 else "float"
-    queue = profiled_queue(adapter.ctx)
-    options = [f"-DREAL={real}", f"-DVEC={real}8"]
-    kernel = cl.Program(adapter.ctx, PEAK).build(options=options).multiply_add
-    items = 64 * 64 * adapter.ctx.devices[0].max_compute_units
-    out = cl.Buffer(adapter.ctx, cl.mem_flags.READ_WRITE, 8 * items)
-    scalar = adapter.dtype.type
-    best = float("inf")
-    for _ in range(5):
-        event = kernel(queue, (items,), (64,), np.int32(items), scalar(0.5), scalar(1), out)
-        event.wait()
-        best = min(best, 1e-9 * (event.profile.end - event.profile.start))
-    return items * 4096 * 8 * 8 * 2 / best
 
 
 def fresh_mesh(adapter: clvoro.Adapter, queue: cl.CommandQueue, points: np.ndarray, n: int) -> MeshState:
@@ -188,11 +128,7 @@ def measure(
     mesh, method = fresh_mesh(adapter, queue, points, n), KINDS[kind]()
     take_steps(mesh, method, WARM_UP, clock)
     with Profile(queue) as profile:
-        _, iterations = take_steps(mesh, method, repeat, clock)
-    counted = [
-        (f"{stage}.{kernel}", cost, iterations if kernel in ITERATED else cost.calls)
-        for (stage, kernel), cost in profile.costs.items()
-    ]
+        take_steps(mesh, method, repeat, clock)
     read = sum(span.read for span in profile.spans) / repeat
     return {
         "kind": kind,
@@ -203,8 +139,6 @@ def measure(
         "cold": statistics.median(cold),
         "read": read,
         "rate": mesh.n / parts["diagram"],
-        "kernels": {name: (cost.seconds / calls, calls / repeat) for name, cost, calls in counted},
-        "bandwidth": profile.bandwidth,
     }
 
 
@@ -224,35 +158,6 @@ COLUMNS = {
     "cold": ms("cold"),
     "to host": lambda r: f"{r['read']:.0f} B",
 }
-
-
-def limits(records: list[dict[str, Any]], peak: float, real: int) -> list[list[str]]:
-    """Time of each kernel per cell, and the times of its least memory traffic and arithmetic."""
-    rows = []
-    last = {r["kind"]: r for r in records}
-    for name, (reals, integers, operations) in NEEDS.items():
-        seen = [r for r in last.values() if name in r["kernels"]]
-        if not seen:
-            continue
-        record = max(seen, key=lambda r: r["cells"])
-        seconds, calls = record["kernels"][name]
-        per_cell = seconds / record["cells"]
-        size = reals * real + integers * 4
-        memory = size / record["bandwidth"] / per_cell
-        arithmetic = operations / peak / per_cell
-        rows.append(
-            [
-                name,
-                record["kind"],
-                f"{calls:.1f}",
-                f"{1e9 * per_cell:.1f}",
-                str(size),
-                str(operations),
-                f"{memory:.0%}",
-                f"{arithmetic:.0%}",
-            ]
-        )
-    return rows
 
 
 def main() -> None:
@@ -279,21 +184,6 @@ def main() -> None:
             record = measure(adapter, kind, points, n, options.repeat, clock)
             report.add(record, f"{kind} {n:,}")
     report.finish(heading(adapter, f"One step, medians of {options.repeat}"))
-    if not options.json:
-        peak = peak_operations(adapter)
-        bandwidth = report.records[-1]["bandwidth"]
-        print(f"Copying moves {1e-9 * bandwidth:.1f} GB/s, multiply-adds reach {1e-9 * peak:.0f} Gflop/s.\n")
-        header = [
-            "kernel",
-            "step",
-            "calls a step",
-            "ns per cell",
-            "bytes needed",
-            "operations",
-            "memory: share of the time",
-            "arithmetic",
-        ]
-        print(markdown(header, limits(report.records, peak, adapter.dtype.itemsize)))
 
 
 if __name__ == "__main__":

@@ -51,19 +51,8 @@ def test_following():
 
 @pytest.mark.slow
 def test_peers():
-    options = (
-        "--sizes",
-        "300",
-        "--sets",
-        "uniform,cubed",
-        "--dims",
-        "2",
-        "--peers",
-        "clvoro,JIGSAW",
-        "--samples",
-        "50",
-    )
-    rows = [r for r in records("peers.py", *options) if r["peer"] != "JIGSAW"]
+    options = ("--sizes", "300", "--sets", "uniform,cubed", "--dims", "2", "--peers", "clvoro", "--samples", "50")
+    rows = records("peers.py", *options)
     assert [r["note"] for r in rows] == ["right"] * 2
     assert max(r["worst"] for r in rows) < 1e-6
 
