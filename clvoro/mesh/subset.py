@@ -75,7 +75,7 @@ def _result_of(mesh: Result, part: Diagram, kept: np.ndarray) -> Result:
 
 def without_holes(mesh: Result) -> Result:
     """Return `mesh` without the cells in the holes of its domain; faces on a hole have its name."""
-    holes = mesh.diagram.domain.holes
+    holes = None if mesh.parts else mesh.diagram.domain.holes
     if holes is None:
         return mesh
     inside = holes.hole_of(mesh.points)

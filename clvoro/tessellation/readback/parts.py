@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 import pyopencl.array as cla
@@ -13,6 +16,7 @@ from ...mesh.diagram import Diagram
 from ...mesh.subset import take_subset
 from ...opencl.engine import Engine
 from ...opencl.peers import ALONE, Peers
+from ...opencl.probe import check_process
 from ..device_diagram import Tessellation
 from ..stages import TessellationStages
 from ..tessellator import Tessellator
@@ -21,20 +25,55 @@ from .diagram import fetch_diagram, order_of, starts_of
 
 def fetch_part(engine: Engine, domain: Domain, t: Tessellation, labels: cla.Array, held: int = 0) -> Diagram:
     """Return the cells of a part in the order of `labels` (n,). Faces towards cells of part k are walls ``"rankK"``."""
-    if t.part is not None and (t.part.peers or ALONE).count == 1:
+    if t.part is None:
+        return fetch_diagram(engine, domain, t, labels, copy=False, held=held)
+    (n, part, whole), own = (t.n, t.part, t.whole), labels.get()[: t.n]
+    points = fetch_diagram(engine, unfolded(domain), replace(t, part=None), labels, copy=False).points
+
+    def read_all() -> Diagram:
         rows = CellRows.of(t, labels).gather(ALONE)
         assert rows is not None
         return rows.diagram(engine, domain)
-    if t.part is None or t.part.ghosts is None or t.whole is None:
-        return fetch_diagram(engine, domain, t, labels, copy=False, held=held)
-    order = order_of(labels.get())
-    places = np.arange(t.whole.n, dtype=np.int32)
-    places[order] = np.arange(t.n)
-    labels = engine.upload(places, np.int32)
-    diagram = fetch_diagram(engine, unfolded(domain), replace(t.whole, part=t.part), labels, copy=False)
-    names = np.full(t.whole.n, "", object)
-    names[t.n :] = [f"rank{part}" for part in t.part.ghosts.parts]
-    return take_subset(diagram, np.arange(t.whole.n) < t.n, names)
+
+    def read() -> Diagram:
+        # Cells share vertices with those of ghosts.
+        made, places, names = whole, np.arange(part.count, dtype=np.int32), np.full(part.count, "", object)
+        if made is None:
+            stages = TessellationStages(engine)
+            binned = stages.bins.build(part.box, part.points, part.count)
+            made = stages.cells.tessellate(part, binned, exact=False)
+        places[order_of(own)] = np.arange(n)
+        assert part.ghosts is not None
+        names[n:] = [f"rank{number}" for number in part.ghosts.parts]
+        numbers, made = engine.upload(places, np.int32), replace(made, part=part)
+        diagram = fetch_diagram(engine, unfolded(domain), made, numbers, copy=False)
+        return take_subset(diagram, np.arange(part.count) < n, names)
+
+    return _LaterDiagram(points, read_all if (part.peers or ALONE).count == 1 else read)
+
+
+class _LaterDiagram(Diagram):
+    """A diagram that is read as a whole when more than its points is used."""
+
+    def __init__(self, points: np.ndarray, read: Callable[[], Diagram]) -> None:
+        self.points, self._read = points, read
+        self._derived, self.home = {}, None
+        self.layer = self._derive("layer")  # parts have no layers
+
+    @cached_property
+    def _made(self) -> Diagram:
+        check_process()
+        made = self._read()
+        del self._read
+        return made
+
+    @cached_property
+    def domain(self) -> Domain:
+        return self._made.domain
+
+    @cached_property
+    def _arrays(self) -> dict[str, Any]:
+        return self._made._arrays
 
 
 def unfolded(domain: Domain) -> Domain:
