@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import cache
 from itertools import product
 
 import numpy as np
@@ -27,6 +28,7 @@ from ..geometry.domain import Domain
 from ..opencl.device_array import buffer_of
 from ..opencl.primitives import NamedArrays
 from .cut_cells import CutCells
+from .decomposition import hilbert_keys
 from .device_diagram import Follow, Tessellation
 from .part import Ghosts, Part, follow_images
 from .periodic.ghost_images import ExtendedBox
@@ -49,6 +51,8 @@ each ball, as a share of the ball's radius. A part also asks for generators in t
 NEAR, FREE = 1.2, 0.8
 """Largest distance between a ball and a box of another part that are compared, over the largest radius of the balls of
 both. Radius around a generator within which all others are known, over its distance from other parts."""
+FARTHEST = 1e6
+"""A distance beyond all others, in units of the domain's frame."""
 NOISE = {"float64": 1e-6, "float32": 1e-4}
 """Bound of the round-off of a reach, as a share of it."""
 FILLED, MATCHED = {"float64": 1e-8, "float32": 1e-3}, {"float64": 1e-5, "float32": 1e-3}
@@ -63,27 +67,39 @@ FAILED = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
 """Summands of a part whose update has failed: zeros for those of `Part.sums`, and 1 for the number of failed parts."""
 
 
+@cache
+def _curve(dim: int) -> np.ndarray:
+    """Return the places along a Hilbert curve of the cells of a grid, row by row; the grid has at most 2^16 cells."""
+    side = 2 ** (16 // dim)
+    cells = np.indices((side,) * dim).reshape(dim, -1).T
+    return hilbert_keys(cells, np.zeros(dim), np.full(dim, side), 16 // dim).astype(np.uint16)
+
+
 class Chunks:
-    """The generators of a part, divided into chunks. Generators of a chunk are near each other, since they follow bins.
+    """The generators of a part, divided into chunks: runs of a Hilbert curve through the cells of a grid.
 
     Parameters
     ----------
     points : (n, d) float
+        In the order of bins.
     least : float
         Lower bound of `spacings`.
 
     Attributes
     ----------
+    order : (n,) int
+        Generators chunk by chunk.
     firsts : (k,) int
         Where the chunks begin.
-    sizes : (k,) int
+    groups : (n,) int
+        The chunk of each generator.
     spacings : (n,) float
         An estimate of the spacing around each generator. A run of `RUN` generators has the median distance between
         successive ones; the estimate is the largest of three runs, that of the generator and the two beside it.
     """
 
     def __init__(self, points: np.ndarray, least: float) -> None:
-        n = len(points)
+        n, dim = points.shape
         ways = np.linalg.norm(np.diff(points, axis=0), axis=1)
         runs = np.arange(max(n // RUN, 1)) * RUN
         usual = np.full(len(runs), least)
@@ -91,11 +107,17 @@ class Chunks:
             usual = np.maximum(usual, np.median(ways[runs[:, None] + np.arange(RUN - 1)], axis=1))
         usual = np.maximum(usual, np.maximum(np.append(usual[1:], usual[-1]), np.append(usual[0], usual[:-1])))
         self.spacings = np.repeat(usual, np.diff(np.append(runs, n)))
-        # Generators may have moved far from the others of their part, and the rows of bins have ends.
-        jumps = 1 + np.flatnonzero(ways > JUMP * self.spacings[:-1])
+        side, lower, upper = 2 ** (16 // dim), points.min(axis=0), points.max(axis=0)
+        cells = ((points - lower) * (side / np.maximum(upper - lower, least))).astype(np.int32)
+        cells = np.minimum(cells, side - 1) @ side ** np.arange(dim)[::-1]
+        self.order = np.argsort(_curve(dim)[cells], kind="stable")
+        # Generators may have moved far from the others of their part.
+        ways = np.linalg.norm(np.diff(points[self.order], axis=0), axis=1)
+        jumps = 1 + np.flatnonzero(ways > JUMP * self.spacings[self.order[:-1]])
         count = math.isqrt(n)
         self.firsts = np.unique(np.concatenate([np.arange(count) * n // count, jumps]))
-        self.sizes = np.diff(np.append(self.firsts, n))
+        self.groups = np.empty(n, np.int32)
+        self.groups[self.order] = np.repeat(np.arange(len(self.firsts)), np.diff(np.append(self.firsts, n)))
 
 
 class BallGroups:
@@ -116,34 +138,46 @@ class BallGroups:
     """
 
     def __init__(self, centers: np.ndarray, radii: np.ndarray, chunks: Chunks) -> None:
-        self.centers, self.radii, self.chunks, firsts = centers, radii.copy(), chunks, chunks.firsts
-        lower, upper = (f.reduceat(centers, firsts, axis=0) for f in (np.minimum, np.maximum))
+        self.centers, self.radii, self.chunks = centers, radii.copy(), chunks
+        x, radii, firsts = centers[chunks.order], radii[chunks.order], chunks.firsts
         self.largest = np.maximum.reduceat(radii, firsts)
-        self.boxes = np.hstack([lower, upper])
+        self.boxes = np.hstack([f.reduceat(x, firsts, axis=0) for f in (np.minimum, np.maximum)])
         self.facts = np.column_stack([self.boxes, self.largest, SKIN * np.minimum.reduceat(radii, firsts)])
 
     def facing(self, facts: np.ndarray) -> Facing:
         """Return how far these balls are from the boxes of another part, which has sent its `facts` (k, 2 d + 2)."""
-        boxes, largest, sizes = facts[:, :-2], facts[:, -2], self.chunks.sizes
-        hull, groups = around(boxes), np.repeat(np.arange(len(sizes)), sizes)
-        farthest = NEAR * np.maximum(self.largest, largest.max())[groups]
-        away = gaps(self.boxes, hull)[groups, 0]
-        near = np.flatnonzero(away <= farthest)
-        away[near] = gaps(np.tile(self.centers[near], 2), hull)[:, 0]
-        near = near[away[near] <= farthest[near]]
-        pairs = [(np.empty(0, int), np.empty(0, int), np.empty(0))]
-        for rows in np.split(near, 1 + np.flatnonzero(np.diff(groups[near]))) if len(near) else []:
-            centers, limits = np.tile(self.centers[rows], 2), NEAR * np.maximum(self.largest[groups[rows[0]]], largest)
-            beside = np.flatnonzero(gaps(around(centers), boxes)[0] <= limits)
-            ways = gaps(centers, boxes[beside])
-            balls, others = np.nonzero(ways <= limits[beside])
-            pairs.append((rows[balls], beside[others], ways[balls, others]))
-        away[near] = np.maximum(away[near], NEAR * self.largest[groups[near]])
-        return Facing(facts, away, *(np.concatenate(columns) for columns in zip(*pairs, strict=True)))
+        boxes, largest, groups, dim = facts[:, :-2], facts[:, -2], self.chunks.groups, self.centers.shape[1]
+        away = gaps(self.boxes, around(boxes))[:, 0]
+        near = np.flatnonzero(away <= NEAR * np.maximum(self.largest, largest.max()))
+        ways, limits = gaps(self.boxes[near], boxes), NEAR * np.maximum.outer(self.largest[near], largest)
+        chosen, beside = np.nonzero(ways <= limits)
+        away[near] = np.min(ways, axis=1, where=ways > limits, initial=FARTHEST)
+        # Pairs of each ball in these groups with all boxes beside its group.
+        counts, firsts = np.zeros(len(away), int), np.zeros(len(away), int)
+        counts[near] = np.bincount(chosen, minlength=len(near))
+        firsts[near] = np.cumsum(counts[near]) - counts[near]
+        balls, away = np.flatnonzero(counts[groups]), away[groups]
+        if not len(balls):
+            return Facing(facts, away, balls, balls, np.empty(0))
+        first, count = firsts[groups[balls]], counts[groups[balls]]
+        ends = np.cumsum(count)
+        pairs = np.arange(ends[-1]) + np.repeat(first - ends + count, count)
+        places, others, limits = np.repeat(balls, count), beside[pairs], limits[chosen, beside][pairs]
+        ways2 = np.zeros(len(places))
+        for axis in range(dim):
+            x = self.centers[places, axis]
+            gap = np.maximum(boxes[others, axis] - x, x - boxes[others, dim + axis])
+            ways2 += np.square(np.maximum(gap, 0, out=gap))
+        ways = np.sqrt(ways2)
+        close = ways <= limits
+        apart = np.minimum.reduceat(np.where(close, FARTHEST, ways), ends - count)
+        away[balls] = np.minimum(away[balls], apart)
+        return Facing(facts, away, places[close], others[close], ways[close])
 
     def meeting(self, facing: Facing) -> np.ndarray:
         """Return which balls, with their skins, meet a box in which the other part has generators, (m,) int."""
-        return np.unique(facing.places[facing.ways <= (1 + SKIN) * self.radii[facing.places]])
+        found = facing.places[facing.ways <= (1 + SKIN) * self.radii[facing.places]]
+        return found[np.diff(found, prepend=-1) > 0]
 
 
 @dataclass(frozen=True)
@@ -369,14 +403,10 @@ class PartSteps(DomainSteps):
 
     def builds_all(self, part: Part, complete: bool, enough: bool) -> bool:
         """Return whether ghosts get cells: in 2D, where the descent of shapes reads the rows of neighbors."""
-        return part.ghosts is None or complete or self._reads_rows
+        return part.ghosts is None or self._reads_rows
 
     def rows(self, previous: Tessellation) -> None:
         """Cells start anew, since ghosts change."""
-
-    def is_complete(self, t: Tessellation) -> bool:
-        """Return whether ghosts have cells."""
-        return t.part is None or t.part.ghosts is None or t.whole is not None
 
     def update(
         self, sites: cla.Array, n: int, previous: Tessellation, sort: Sort, follow: Follow
@@ -527,7 +557,7 @@ class PartSteps(DomainSteps):
         firsts = np.arange(0, len(balls), GROUP)
         lower = np.minimum.reduceat(balls[:, :dim] - balls[:, dim:], firsts, axis=0)
         groups = np.hstack([lower, np.maximum.reduceat(balls[:, :dim] + balls[:, dim:], firsts, axis=0)])
-        near = np.repeat((gaps(own.boxes, groups) <= 0).any(axis=1), own.chunks.sizes)
+        near = (gaps(own.boxes, groups) <= 0).any(axis=1)[own.chunks.groups]
         near[known] = False
         rows = np.flatnonzero(near)
         places = own.centers[rows]
