@@ -207,7 +207,7 @@ class ProjectedMethod(Method):
                 w: CellWeights = stages.density.cell_weights(t, mesh.h, log_ratio)
             else:
                 w = stages.density.lloyd_weights(t, mesh.h, lloyd, gradient, log_ratio)
-            mesh.follows_log_ratio = self.error_target > 0 or self.careful
+            mesh.follows_log_ratio = max(self.error_target, self.scale_per_error, self.careful) > 0
             if self.error_target and self.steps > 2:
                 self._control_penalty(mesh.mean_log_ratio_error(w))
             self.steps += 1
@@ -216,7 +216,7 @@ class ProjectedMethod(Method):
                 beyond = mesh.mean_log_ratio_error(w) - MET_ERROR
                 penalty = max(penalty, EXACT_PENALTY_PER_ERROR * beyond)
             scale = self.log_ratio_scale
-            if self.scale_per_error and mesh.knows_log_ratio:
+            if self.scale_per_error:
                 scale = max(scale, self.scale_per_error * mesh.mean_log_ratio_error(w) - 3 * scale)
             if self.gradient_from_field:
                 sizes = engine.scratch(mesh.n)

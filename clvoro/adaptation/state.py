@@ -170,9 +170,8 @@ class MeshState:
     h, error, quality : (n,) real
     local_length : (n,) real
         min(L, h), the unit of bounds of the motion.
-    follows_log_ratio, knows_log_ratio : bool
-        Summarize log(L / h) with error and quality, so that `mean_log_ratio_error` needs no transfer of its own; the
-        last summary has it.
+    follows_log_ratio : bool
+        Summarize log(L / h) with error and quality, so that `mean_log_ratio_error` needs no transfer of its own.
     taken : (k,) int32
         Labels of those whose places fixed generators have taken; -1 for none.
     power : Tessellator or None
@@ -206,7 +205,7 @@ class MeshState:
         self._ordered: cla.Array | None = None
         self.tessellator = Tessellator(self.stages, self.domain, self._target_sizes, coarser, straight=True)
         self.power: Tessellator | None = None
-        self.follows_log_ratio = self.knows_log_ratio = False
+        self.follows_log_ratio = self._knows_log_ratio = False
         self.taken = np.full(setup.first_row, -1, np.int32) if taken is None else taken
         if isinstance(start, Arrays):
             self._data = start
@@ -460,7 +459,7 @@ class MeshState:
                 own |= {"changed": compared.changed, "ever_changed": compared.ever_changed}
             if self.follows_log_ratio:
                 own["log_ratio"] = self.stages.density.cell_weights(self.t, self.h).log_ratio
-            self.knows_log_ratio = self.follows_log_ratio
+            self._knows_log_ratio = self.follows_log_ratio
             self.summaries.collect_all(own, self.n)
 
     def move(self, d: Displacement) -> None:
@@ -480,9 +479,9 @@ class MeshState:
 
     def mean_log_ratio_error(self, w: CellWeights) -> float:
         """Return the mean of |log(L / h)|."""
-        if not self.knows_log_ratio:
+        if not self._knows_log_ratio:
             self.summaries.collect("log_ratio", w.log_ratio, self.n)
-        self.knows_log_ratio = True
+        self._knows_log_ratio = True
         return self.summaries.read_one("log_ratio").magnitude / self.total / self.engine.cell_dim
 
     def missing_cells(self, w: CellWeights | None = None) -> float:
