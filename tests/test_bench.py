@@ -58,15 +58,6 @@ def test_peers():
 
 
 @pytest.mark.slow
-def test_restart():
-    cold, *moved = records("restart.py", "--moves", "2")
-    assert cold["steps"] > 100
-    assert len(moved) == 2
-    assert all(r["to_tolerance"] <= 5 for r in moved)
-    assert all(r["mass"] < 1e-12 for r in moved)
-
-
-@pytest.mark.slow
 def test_transfer():
     rows = records("transfer.py", "--sizes", "500,4000", "--dims", "2", "--repeat", "1")
     first, second, free = (r for r in rows if r["rate"] is not None)

@@ -86,7 +86,7 @@ def test_runs_say_it_before_they_begin(ctx):
 
 @pytest.mark.slow
 def test_single_precision_with_sizes_1_to_1000(ctx):
-    """The mean error is that of double precision to 1e-3, without a warning. `bench/precision.py` does 1e6 cells."""
+    """The mean error is that of double precision to 1e-3, without a warning."""
     box = clvoro.Box((0, 0), (2.5, 1.5))
     field = Distance([Circle((0.9, 0.75), 0.0)], 1.5e-4, slope=999 * 1.5e-4 / 1.767)
     mean = {}

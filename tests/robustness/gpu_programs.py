@@ -1,4 +1,9 @@
-"""Every program with its macros, and what the compilers of GPUs make of its kernels."""
+"""Every program with its macros, and what the compilers of GPUs make of its kernels.
+
+Needed are clang, the built-in functions libclc of the same version (`apt-get install clang-14 libclc-14`) and ptxas (in
+the wheel nvidia-cuda-nvcc-cu12 on PyPI: `pip download --no-deps nvidia-cuda-nvcc-cu12`, unzip it, and put
+nvidia/cuda_nvcc/bin on the PATH).
+"""
 
 from __future__ import annotations
 

@@ -171,7 +171,7 @@ def test_main_kernels_take_few_registers_and_little_private_memory(ctx, dim, tmp
 @pytest.mark.parametrize("vendor", ["NVIDIA", "AMD"])
 def test_kernels_take_few_registers_and_little_private_memory(ctx, vendor, dtype, tmp_path):
     if not gpu_programs.can_measure(vendor):
-        pytest.skip("needs clang, libclc and, for NVIDIA, ptxas: see bench/gpu_model.py --help")
+        pytest.skip("needs clang, libclc and, for NVIDIA, ptxas: see gpu_programs.py")
     sources = gpu_programs.programs_of_all_kinds(ctx, dtype)
     check_figures(vendor, sources, tmp_path, LIMITS)
 
