@@ -1,6 +1,7 @@
 """The MPAS mesh specification on a sphere, compared with formulas other than those of the package.
 
-Arcs are those of cross products, and areas of triangles those of l'Huilier's theorem from their three sides.
+Arcs are those of cross products, and areas of triangles those of l'Huilier's theorem from their three sides. The
+operators on such a file are in `tests/finite_volumes/test_shallow_water.py`.
 """
 
 import numpy as np
@@ -9,7 +10,7 @@ from scipy.spatial import SphericalVoronoi
 
 import clvoro
 from clvoro.geometry.sphere import arc_excess, triangle_areas
-from tests.earth.test_netcdf_mpas import MEASURES, TABLES, Mesh, check_divergence, check_energy, matrix, slow_weights
+from tests.earth.test_netcdf_mpas import MEASURES, TABLES, Mesh, check_divergence, check_energy, slow_weights
 from tests.reference.globes import CASES, arcs, is_double, made, triangles
 
 
@@ -207,45 +208,6 @@ def test_weights_are_those_of_the_formula(mesh):
         assert mesh.edgesOnEdge[e] == list(others)
         row = mesh["weightsOnEdge"][e, : len(others)]
         np.testing.assert_allclose(row, weights, rtol=1e-10, atol=1e-13 * np.abs(row).max())
-
-
-@pytest.mark.sparse(2)
-def test_the_coriolis_force_does_no_work(mesh):
-    check_energy(mesh)
-
-
-def test_divergence_of_the_rotated_flow_is_the_mean_of_the_cells(mesh):
-    if mesh.radius == 1:  # the tolerance is that of numbers near 1
-        check_divergence(mesh)
-
-
-def test_curl_and_rotated_flow_of_a_potential(mesh):
-    """A gradient has no curl around triangles, and a curl has no divergence: both to round-off."""
-    rng = np.random.default_rng(11)
-    potential, stream = rng.standard_normal(mesh.n), rng.standard_normal(mesh.v)
-    gradient = np.diff(potential[np.array(mesh.cellsOnEdge)], axis=1)[:, 0]
-    curl = np.diff(stream[np.array(mesh.verticesOnEdge)], axis=1)[:, 0]
-    for edges, tables, values in (
-        (mesh.edgesOnVertex, mesh.verticesOnEdge, gradient),
-        (mesh.edgesOnCell, mesh.cellsOnEdge, curl),
-    ):
-        for i, around in enumerate(edges):
-            signs = [1 if tables[e][0] == i else -1 for e in around]
-            assert sum(s * values[e] for s, e in zip(signs, around, strict=True)) == pytest.approx(0, abs=1e-13)
-
-
-def test_tangential_velocities_of_a_turning_sphere(ctx, tmp_path):
-    """On cells that are nearly regular the weights give the velocity along edges to a tenth.
-
-    They are inconsistent on other cells than regular hexagons (Peixoto, J. Comput. Phys. 310 (2016) 127).
-    """
-    run = clvoro.Adapter(ctx).run(clvoro.Sphere(1), 1.0, n_cells=300, effort="fast")
-    run.to_netcdf(tmp_path / "mesh.nc", convention="mpas")
-    mesh = Globe(tmp_path / "mesh.nc")
-    angle, lat = mesh["angleEdge"], mesh["latEdge"]
-    across, along = np.cos(lat) * np.cos(angle), -np.cos(lat) * np.sin(angle)
-    error = matrix(mesh) @ across - along
-    assert np.sqrt((error**2).mean()) < 0.1
 
 
 def test_more_than_three_cells_may_share_a_vertex(ctx, tmp_path):
