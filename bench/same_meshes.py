@@ -32,22 +32,11 @@ import clvoro
 from clvoro import sizing
 
 SEED = 20251
-DIAGRAM = {
-    "points": "points",
-    "volumes": "volumes",
-    "centroids": "centroids",
-    "neighbor_starts": "neighbor_starts",
-    "neighbors": "neighbors",
-    "shifts": "shifts",
-    "face_measures": "face_measures",
-    "face_centroids": "face_centroids",
-    "vertices": "vertices",
-    "cell_vertex_starts": "cell_vertex_starts",
-    "cell_vertices": "cell_vertices",
-    "face_vertex_starts": "face_vertex_starts",
-    "face_vertices": "face_vertices",
-}
-"""Arrays of a diagram: name in the file, and attribute. Diagrams in 2D and 3D lack some."""
+DIAGRAM = (
+    *("points", "volumes", "centroids", "neighbor_starts", "neighbors", "shifts", "face_measures", "face_centroids"),
+    *("vertices", "cell_vertex_starts", "cell_vertices", "face_vertex_starts", "face_vertices"),
+)
+"""Arrays of a diagram. Diagrams in 2D and 3D lack some."""
 RESULT = {"size": "target_size", "error": "size_error", "quality": "quality", "origin": "origin"}
 """Arrays that a result has besides."""
 
@@ -64,9 +53,6 @@ class Case:
     dtype: str = "float64"
 
 
-# What is compared: each attribute of the package's objects is read here and nowhere else.
-
-
 def arrays_of(mesh: clvoro.Diagram | clvoro.Result | Arrays) -> Arrays:
     """Return the arrays of a result, a diagram, or what is a mapping of arrays already."""
     if isinstance(mesh, dict):
@@ -74,19 +60,11 @@ def arrays_of(mesh: clvoro.Diagram | clvoro.Result | Arrays) -> Arrays:
     result = isinstance(mesh, clvoro.Result)
     diagram = mesh.diagram if result else mesh
     derived = () if "face_vertices" in diagram._arrays else ("face_vertex_starts", "face_vertices")
-    found = {name: getattr(diagram, attribute, None) for name, attribute in DIAGRAM.items() if name not in derived}
+    found = {name: getattr(diagram, name, None) for name in DIAGRAM if name not in derived}
     if result:
         found |= {name: getattr(mesh, attribute) for name, attribute in RESULT.items()}
         found["points"] = mesh.points
     return {name: np.asarray(array) for name, array in found.items() if array is not None}
-
-
-def points_of(result: clvoro.Result) -> np.ndarray:
-    return result.points
-
-
-def centers_of(result: clvoro.Result) -> np.ndarray:
-    return result.diagram.centroids
 
 
 # Runs.
@@ -105,7 +83,7 @@ def adapted_again(domain: Any, first: Any, second: Any, **options: Any) -> Run:
 
     def run(adapter: clvoro.Adapter) -> clvoro.Result:
         before = adapted(domain, first, **options)(adapter)
-        return adapted(domain, second, points=points_of(before), **options)(adapter)
+        return adapted(domain, second, points=before.points, **options)(adapter)
 
     return run
 
@@ -115,7 +93,7 @@ def transferred(domain: Any, first: Any, second: Any, **options: Any) -> Run:
 
     def run(adapter: clvoro.Adapter) -> Arrays:
         one, other = (adapted(domain, size, effort="fast")(adapter) for size in (first, second))
-        x = centers_of(one)
+        x = one.diagram.centroids
         values = np.column_stack([x[:, 0] ** 2 + x[:, -1], x[:, 0] > x[:, 1]])
         return {"values": one.transfer(values, other, adapter=adapter, **options)}
 
@@ -458,18 +436,14 @@ COLUMNS = {
 }
 
 
-def make_options() -> argparse.ArgumentParser:
+def main() -> int:
     made = parser(__doc__)
     made.set_defaults(dtype=None)
     made.add_argument("--save", type=Path, metavar="FILE.json", help="write the hashes")
     made.add_argument("--arrays", action="store_true", help="with --save: write the arrays, too")
     made.add_argument("--compare", type=Path, metavar="FILE.json", help="print what differs from that file")
     made.add_argument("--only", default="", metavar="SUBSTRING", help="of the names of runs")
-    return made
-
-
-def main(arguments: list[str] | None = None) -> int:
-    options = make_options().parse_args(arguments)
+    options = made.parse_args()
     comparison = Comparison(options.compare) if options.compare else None
     context = clvoro.create_context(options.device)
     adapters = {dtype: clvoro.Adapter(context, dtype=dtype) for dtype in ("float64", "float32")}

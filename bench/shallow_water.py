@@ -103,30 +103,6 @@ def mountain(mesh: Mesh) -> np.ndarray:
     return 2000 * (1 - np.minimum(away, wide) / wide)
 
 
-def bisected_icosahedron(n: int) -> np.ndarray:
-    """Return the generators of an icosahedral mesh of n = 10 4^k + 2 cells, unit vectors (n, 3).
-
-    Raises
-    ------
-    ValueError
-        If n is another number.
-    """
-    levels = round(math.log((n - 2) / 10, 4)) if n > 2 else 0
-    if n != 10 * 4**levels + 2:
-        raise ValueError(f"no icosahedral mesh has {n} cells; expected 10 4^k + 2, such as 2562")
-    golden = (1 + math.sqrt(5)) / 2
-    corners = [
-        np.roll((first, second, 0.0), k) for k in range(3) for first in (-1.0, 1.0) for second in (-golden, golden)
-    ]
-    points = unit(np.array(corners))
-    for _ in range(levels):
-        diagram = clvoro.voronoi(clvoro.Sphere(1), points)
-        cells = np.repeat(np.arange(len(points)), np.diff(diagram.neighbor_starts))
-        once = cells < diagram.neighbors
-        points = np.vstack([points, unit(points[cells[once]] + points[diagram.neighbors[once]])])
-    return points
-
-
 def make_mesh(adapter: clvoro.Adapter, kind: str, n: int, effort: str) -> clvoro.Diagram:
     """Return a mesh of `n` cells: uniform, graded or icosahedral, after the Lloyd steps that follow a plus."""
     kind, _, lloyd = kind.partition("+")
@@ -137,7 +113,10 @@ def make_mesh(adapter: clvoro.Adapter, kind: str, n: int, effort: str) -> clvoro
         return 1 + 1.5 * (1 - (x @ fine) / RADIUS)
 
     if kind == "icosahedral":
-        diagram = adapter.diagram(sphere, RADIUS * bisected_icosahedron(n))
+        bisections = round(math.log(max(n - 2, 10) / 10, 4))
+        if n != 10 * 4**bisections + 2:
+            raise ValueError(f"no icosahedral mesh has {n} cells; expected 10 4^k + 2, such as 2562")
+        diagram = adapter.diagram(sphere, sphere.icosahedral_points(bisections))
     else:
         size = graded if kind == "graded" else 1.0
         diagram = adapter.run(sphere, size, n_cells=n, effort=effort, seed=FIRST_SEED).diagram

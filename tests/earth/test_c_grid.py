@@ -227,21 +227,9 @@ def test_random_mesh_is_rejected_for_mpas(globe):
         report.demand()
 
 
-def bisected_icosahedron(times):
-    """The corners, after each edge was halved `times` times."""
-    points = icosahedron() / np.linalg.norm(icosahedron(), axis=1)[:, None]
-    for _ in range(times):
-        a, b, c = points[ConvexHull(points).simplices].transpose(1, 0, 2)
-        middles = np.concatenate([a + b, b + c, c + a])
-        middles /= np.linalg.norm(middles, axis=1)[:, None]
-        _, rows = np.unique(middles.round(9), axis=0, return_index=True)
-        points = np.concatenate([points, middles[rows]])
-    return points
-
-
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
 def test_bisected_icosahedron_is_accepted_for_mpas(ctx, dtype):
-    points = bisected_icosahedron(3)
+    points = clvoro.Sphere(1.0).icosahedral_points(3)
     assert len(points) == 642
     d = clvoro.Adapter(ctx, dtype).diagram(clvoro.Sphere(1.0), points)
     report = d.check(solver="mpas")

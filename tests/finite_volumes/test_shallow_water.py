@@ -144,4 +144,4 @@ def test_icosahedral_mesh(ctx):
     sides = np.diff(made.neighbor_starts)
     assert (np.bincount(sides) == [0, 0, 0, 0, 0, 12, 150]).all()
     with pytest.raises(ValueError, match="2563 cells; expected"):
-        shallow_water.bisected_icosahedron(2563)
+        shallow_water.make_mesh(clvoro.Adapter(ctx), "icosahedral", 2563, "fast")
