@@ -14,7 +14,6 @@ names contain the text, `--dtype` those of one precision.
 
 from __future__ import annotations
 
-import argparse
 import hashlib
 import json
 import sys

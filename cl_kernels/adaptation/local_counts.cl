@@ -19,7 +19,7 @@
    preferred, for insertion large ones of many faces, for deletion small ones of few faces. */
 kernel void score_potential(const int size, global const int *starts, global const int *neighbors,
                             global const REAL *log_ratio, global const REAL *potential, const REAL offset,
-                            const REAL least, global const ulong *blocked, global ulong *keys)
+                            const REAL least, global const ulong *blocked, NAME_ARGS, global ulong *keys)
 {
     WORK_ITEM(i);
     const REAL phi = potential[i] + offset, sign = phi > 0 ? 1 : -1;
@@ -28,7 +28,7 @@ kernel void score_potential(const int size, global const int *starts, global con
         inner = neighbors[k] >= 0;
     const REAL magnitude =
         fabs(phi) + sign * need_of_split(log_ratio[i], starts[i + 1] - starts[i]) - (inner ? 0 : WALL_COST);
-    keys[i] = site && magnitude > 0 ? site_key(magnitude, i) : 0;
+    keys[i] = site && magnitude > 0 ? site_key(magnitude, NAME(i)) : 0;
 }
 
 /* before = potential; rhs = V rho - 1 - changes, with changes at the `chosen` sites, too. */

@@ -156,16 +156,15 @@ inline void move_paired(int i, REAL2 target, global REAL2 *points, global REAL2 
 }
 
 /* Move the generators of pairs. Cell p moves its partner if that is not at the wall itself; slots[i] is the place of
-   cell i among those at the wall. */
+   cell i among those at the wall. Only the first n generators move: the others are ghosts. */
 kernel void move_pairs(const int size, global const int *cells, const int n, global const int *slots,
                        global const int *partners, global const REAL2 *targets, global REAL2 *points,
                        global REAL2 *velocity)
 {
     WORK_ITEM(p);
     const int i = cells[p], j = partners[p];
-    if (i >= n)
-        return;
-    move_paired(i, targets[2 * p], points, velocity);
-    if (j >= 0 && slots[j] >= size)
+    if (i < n)
+        move_paired(i, targets[2 * p], points, velocity);
+    if (j >= 0 && j < n && slots[j] >= size)
         move_paired(j, targets[2 * p + 1], points, velocity);
 }

@@ -1,7 +1,15 @@
 #include "geometry/site.h"
 
-/* One of two generators, the same for both cells. */
-#ifndef FIRST_OF
+/* One of two generators, the same for both cells. -DBY_PLACE: by their positions, since parts of a domain number them
+   differently. */
+#ifdef BY_PLACE
+#define FIRST_OF(i, j, points) first_in_space(i, j, points)
+inline int first_in_space(int i, int j, global const REAL *points)
+{
+    const REAL x = points[STRIDE * i] - points[STRIDE * j], y = points[STRIDE * i + 1] - points[STRIDE * j + 1];
+    return x < 0 || (x == 0 && y < 0) ? i : j;
+}
+#else
 #define FIRST_OF(i, j, points) min(i, j)
 #endif
 

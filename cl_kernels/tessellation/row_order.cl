@@ -6,16 +6,8 @@
    faces that begin with the least one, in ascending order. Walls come first. One work-item per generator.
 
    reach[i] is the distance of the farthest corner of cell i from its generator, or a bound of it. */
-#define FIRST_OF(i, j, points) first_in_space(i, j, points)
 #include "geometry/site.h"
 #include "tessellation/report.h"
-
-/* The generator of two that comes first by its position. */
-inline int first_in_space(int i, int j, global const REAL *points)
-{
-    const REAL x = points[STRIDE * i] - points[STRIDE * j], y = points[STRIDE * i + 1] - points[STRIDE * j + 1];
-    return x < 0 || (x == 0 && y < 0) ? i : j;
-}
 
 /* The label of a neighbor; that of a wall is negative. */
 inline int label_of(int row, global const int *labels)

@@ -219,7 +219,12 @@ def take_places(
     taken : (k,) int32
         Labels of those whose places they have taken; -1 for none.
     """
-    points, labels = points.copy(), labels.copy()
+    taken = find_places(points, labels, fixed, domain, n_fixed)
+    return *put_fixed(points, labels, fixed, taken, domain), taken
+
+
+def find_places(points: np.ndarray, labels: np.ndarray, fixed: np.ndarray, domain: Domain, n_fixed: int) -> np.ndarray:
+    """Return the labels of the nearest others, as `take_places`."""
     x, periods = in_frame(fixed, domain)
     others = np.flatnonzero(labels >= n_fixed)
     places = np.full(len(fixed), -1)
@@ -238,12 +243,30 @@ def take_places(
             if places[row] < 0 and not used[candidate]:
                 places[row], used[candidate] = others[candidate], True
         others = others[~used]
+    return np.where(places >= 0, labels[places], -1).astype(np.int32)
+
+
+def put_fixed(
+    points: np.ndarray, labels: np.ndarray, fixed: np.ndarray, taken: np.ndarray, domain: Domain, last: bool = True
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return generators and labels, of a part of all, with fixed ones in place of those with the labels `taken` (k,).
+
+    The `last` part has those, too, that take no place.
+    """
+    points, labels = points.copy(), labels.copy()
     positions, names = domain.place(fixed, points.dtype), np.arange(len(fixed), dtype=labels.dtype)
-    there = places >= 0
-    taken = np.where(there, labels[places], -1).astype(np.int32)
-    points[places[there]], labels[places[there]] = positions[there], names[there]
-    points = np.concatenate([points, positions[~there]])
-    return points, np.concatenate([labels, names[~there]]), taken
+    _, rows, mine = np.intersect1d(labels, taken, assume_unique=False, return_indices=True)
+    points[rows], labels[rows] = positions[mine], names[mine]
+    new = np.flatnonzero((taken < 0) & last)
+    return np.concatenate([points, positions[new]]), np.concatenate([labels, names[new]])
+
+
+def near_places(points: np.ndarray, fixed: np.ndarray, domain: Domain) -> np.ndarray:
+    """Return the rows of those of `points` (n, d), of a part of all, that may have to give their places, (k,) int."""
+    x, periods = in_frame(fixed, domain)
+    count = min(CANDIDATES + len(fixed), len(points))
+    tree = scipy.spatial.KDTree(points.astype(np.float64), boxsize=periods)
+    return np.unique(tree.query(x, k=max(count, 1))[1]) if count else np.empty(0, int)
 
 
 def clear_balls(
@@ -311,5 +334,5 @@ def origins(labels: np.ndarray, started: int, taken: np.ndarray) -> np.ndarray:
         Labels of those whose places fixed generators have taken, or -1.
     """
     k = len(taken)
-    before = np.concatenate([taken, labels[k:]])
+    before = np.where(labels < k, np.append(taken, -1)[np.minimum(labels, k)], labels)
     return np.where((before >= k) & (before < started), before - k, -1).astype(np.int32)

@@ -14,6 +14,7 @@ from ..mesh.results import Result
 from ..opencl.engine import Engine
 from ..tessellation.readback.parts import CellRows
 from .estimates import holder_of_all
+from .fixed_points import put_back
 
 _OF_CELLS = ("target_size", "size_error", "quality", "origin")
 """Arrays of a result with one row per cell."""
@@ -26,6 +27,8 @@ class ResultParts:
     engine: Engine
     domain: Domain
     rows: CellRows
+    fixed: np.ndarray
+    """(k, d) float64. Positions of the first cells of the whole mesh."""
 
     def __reduce__(self) -> tuple[Any, ...]:
         return type(None), ()  # without MPI the cells of a rank are a mesh of their own
@@ -71,5 +74,6 @@ class ResultParts:
         order = np.argsort(np.concatenate(labels), kind="stable")
         engine = holder_of_all(self.engine, len(order), self.domain)
         diagram = rows.diagram(engine, self.domain)
+        put_back(diagram, self.fixed)
         arrays = {name: np.concatenate(values)[order] for name, values in found.items()}
         return dataclasses.replace(result, points=diagram.points, diagram=diagram, parts=None, **arrays)

@@ -17,7 +17,7 @@ import pyopencl.array as cla
 from ..opencl.device_array import read_numbers
 from ..opencl.engine import Engine
 from ..opencl.workspace import framed
-from ..solvers.components import balance_components, connected_components
+from ..solvers.components import Components, balance_components
 from .tuning import (
     BALANCE_TOLERANCE,
     BLOCKED_RINGS,
@@ -47,16 +47,15 @@ class PieceCounts:
     """
 
     def __init__(self, mesh: MeshState, w: CellWeights) -> None:
-        self._piece = connected_components(mesh.t.starts.get(), mesh.t.neighbors.get())
-        self._cells = np.bincount(self._piece)
-        self._required = np.bincount(self._piece, w.weight.get())
+        self._components = Components(mesh.engine, mesh.t)
+        self._cells, self._required = self._components.sums(None, w.weight)
 
     def offset(self, potential: cla.Array, changes: cla.Array) -> None:
         """Shift `potential` (n,) in each piece so that its mean is the offset, after `changes` (n,) int32."""
-        values, piece = potential.get(), self._piece
-        missing = self._required - self._cells - np.bincount(piece, changes.get())
-        means = np.bincount(piece, values) / self._cells
-        shifted = values + (offset_of(missing, self._cells) - means)[piece]
+        values = potential.get()
+        changed, sums = self._components.sums(changes, values)
+        missing, means = self._required - self._cells - changed, sums / self._cells
+        shifted = values + (offset_of(missing, self._cells) - means)[self._components.of_cell]
         potential.set(shifted.astype(values.dtype))
 
 
@@ -78,12 +77,13 @@ class LocalCounts:
         engine, k, n, t, poisson = self.engine, self._kernels, mesh.n, mesh.t, mesh.stages.poisson
         selection, real = mesh.stages.insertion_deletion, engine.real.type
         potential, before, source = (engine.scratch(n) for _ in range(3))
-        chosen, blocked, keys = (engine.scratch(n, np.uint64) for _ in range(3))
+        chosen, blocked, keys = (engine.scratch(t.rows, np.uint64) for _ in range(3))
         for array in (potential, changes, chosen, blocked):
             array.fill(0)
         missing, total = mesh.missing_cells(w), 0
         pieces = PieceCounts(mesh, w) if mesh.domain.n_pieces > 1 else None
-        laplacian = poisson.assemble(t.starts, t.neighbors, t.face_measures, mesh.points, tolerance=BALANCE_TOLERANCE)
+        graph = t.starts, t.neighbors, t.face_measures, t.points
+        laplacian = poisson.assemble(*graph, tolerance=BALANCE_TOLERANCE, part=t.part)
         for turn in count():
             offset = real(offset_of(missing, math.inf) if pieces is None else 0)
             if turn:
@@ -99,11 +99,12 @@ class LocalCounts:
                     offset,
                     real(LEAST_GAIN),
                     selection.spread(t, blocked, BLOCKED_RINGS),
+                    *t.name_args,
                     keys,
                 )
                 chosen = selection.choose_once(t, keys, SITE_RINGS, mesh.labels, mesh.fixed)
             engine.run_each(k.try_changes, n, w.weight, changes, chosen, potential, offset, before, source)
-            balance_components(mesh.domain, t, source, w.weight)
+            balance_components(mesh.engine, mesh.domain, t, source, w.weight)
             poisson.solve(
                 laplacian,
                 source,
@@ -129,9 +130,9 @@ class LocalCounts:
                 blocked,
                 self._accepted,
             )
-            inserted, deleted = map(int, read_numbers(self._accepted, 0, 2))
+            inserted, deleted = map(int, engine.peers.total(read_numbers(self._accepted, 0, 2)))
             missing, total = missing - inserted + deleted, total + inserted + deleted
-            if inserted + deleted <= LEAST_CHANGES * n:
+            if inserted + deleted <= LEAST_CHANGES * mesh.total:
                 break
         return total > 0
 

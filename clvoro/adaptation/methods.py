@@ -68,7 +68,7 @@ class PublishedMethod(Method):
         motion, poisson, lloyd = stages.motion, stages.poisson, t.offsets
         correction, source = engine.scratch(mesh.points.shape), engine.scratch(mesh.n)
         poisson.subtract_mean_source(mesh.error, t.volumes, source)
-        balance_components(mesh.domain, t, source, t.volumes)
+        balance_components(mesh.engine, mesh.domain, t, source, t.volumes)
         with engine.workspace.frame():
             laplacian = poisson.assemble(
                 t.starts, t.neighbors, t.face_measures, t.points, tolerance=r.tolerance, part=t.part
@@ -115,7 +115,7 @@ class WeightedMethod(Method):
         w = stages.density.lloyd_weights(t, mesh.h, lloyd, correction)
         mesh.zero_fixed(lloyd)
         poisson.subtract_mean_source(w.log_ratio, w.weight, source)
-        balance_components(mesh.domain, t, source, w.weight)
+        balance_components(mesh.engine, mesh.domain, t, source, w.weight)
         with engine.workspace.frame():
             laplacian = poisson.assemble(
                 t.starts,

@@ -47,13 +47,14 @@ SETTLED = "tolerance of the moving mesh met"
 
 def check_shared(arguments: RunArguments) -> None:
     """Raise if ranks or devices cannot share such a run."""
-    (domain, _, options, _, fixed, _), what = arguments, ""
+    domain, _, options, *_ = arguments
+    what = ""
     if not domain.may_have_parts:
-        what = f"domain is {domain!r:.80}, expected a Sphere, or a Box without lines, holes or surfaces inside"
+        what = f"domain is {domain!r:.80}, expected one in 2D, a Sphere or a Box, without lines or surfaces inside"
     elif options.method in ("transport", *MOVING):
         what = f"method is {options.method!r}, expected one other than {', '.join(map(repr, ('transport', *MOVING)))}"
-    elif options.layers or fixed is not None:
-        what = "layers or fixed generators are given, expected none of them"
+    elif options.layers:
+        what = "layers are given, expected none"
     if what:
         raise InputError(f"{what}, since ranks or devices share the run; use an Adapter without comm and devices")
 
@@ -522,7 +523,7 @@ class Run:
             origin = np.full_like(origin, -1)
         parts = None
         if self._is_part:
-            parts = ResultParts(mesh.engine, self._domain, CellRows.of(mesh.t, mesh.labels))
+            parts = ResultParts(mesh.engine, self._domain, CellRows.of(mesh.t, mesh.labels), fixed)
         held = self.arguments.fixed
         diagram, settings = mesh.fetch_diagram(len(held)), dict(self._settings)
         if self._options.layers and self._domain.extrudes_layers:
@@ -539,7 +540,7 @@ class Run:
             if (after := mesh.setup.after_layers) is not None:
                 size = np.where(diagram.layer > 0, np.cbrt(diagram.volumes), mesh.size_factor * after(diagram.points))
             error, quality = self._measured_again(diagram, size)
-        put_back(diagram, fixed)
+        put_back(diagram, fixed[labels[labels < len(fixed)]] if self._is_part else fixed)
         result = Result(
             points=diagram.points,
             diagram=diagram,

@@ -30,7 +30,7 @@ from ..tessellation.readback.diagram import order_of
 from ..tessellation.readback.parts import fetch_part
 from ..tessellation.tessellator import Tessellator
 from .density import CellWeights
-from .fixed_points import clear_balls, take_places
+from .fixed_points import clear_balls, find_places, near_places, put_fixed, take_places
 from .insertion_deletion import CellSizes, Change, Generators, Outcome
 from .metric import Neighborhoods
 from .motion import Balls, Displacement, Moving
@@ -660,7 +660,13 @@ class MeshState:
         taken = self.taken
         if finest and len(taken):
             host = start["points"].get(), start["labels"].get()
-            *new, taken = self.setup.place_fixed(*host)
+            if peers.count > 1:
+                setup, near = self.setup, near_places(host[0], self.setup.points, self.domain)
+                told = [np.concatenate(peers.exchange([array[near]] * peers.count)) for array in host]
+                taken = find_places(*told, setup.points, self.domain, self.fixed)
+                new = put_fixed(*host, setup.points, taken, self.domain, last=peers.number == peers.count - 1)
+            else:
+                *new, taken = self.setup.place_fixed(*host)
             start["points"], start["labels"] = map(self.engine.upload, new, (None, np.int32))
         # Free the other arrays. After an interruption `update` computes them again.
         self._data = Arrays(self._data.generators)

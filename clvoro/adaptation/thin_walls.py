@@ -51,41 +51,16 @@ class ThinWalls:
         engine, k = self.engine, self._kernels
         assert t.trimmed is not None
         chords, convex = t.trimmed.chords, t.trimmed.convex
-        u, n, args = chords.touched_count, np.int32(t.n), free.device_args(engine)
+        u, n, whole = chords.touched_count, np.int32(t.rows), t.whole or t
         with engine.workspace.frame():
             partners, targets = engine.scratch(u, np.int32), engine.scratch((2 * u, 2))
+            points, h = t.with_ghosts(engine, moving.points, h)
+            labels = t.fixed_args(engine, moving.labels, moving.fixed)
+            graph = convex.starts, convex.neighbors
+            args = points, h, *labels, *free.device_args(engine)
             engine.run_each(
-                k.find_partners,
-                u,
-                chords.touched,
-                n,
-                convex.starts,
-                convex.neighbors,
-                t.starts,
-                t.neighbors,
-                moving.points,
-                h,
-                moving.labels,
-                np.int32(moving.fixed),
-                *args,
-                partners,
+                k.find_partners, u, chords.touched, n, *graph, whole.starts, whole.neighbors, *args, partners
             )
-            engine.run_each(
-                k.place_pairs,
-                u,
-                chords.touched,
-                n,
-                chords.slots,
-                partners,
-                convex.starts,
-                convex.neighbors,
-                moving.points,
-                h,
-                moving.labels,
-                np.int32(moving.fixed),
-                *args,
-                targets,
-            )
-            engine.run_each(
-                k.move_pairs, u, chords.touched, n, chords.slots, partners, targets, moving.points, moving.velocity
-            )
+            engine.run_each(k.place_pairs, u, chords.touched, n, chords.slots, partners, *graph, *args, targets)
+            given = chords.slots, partners, targets, moving.points, moving.velocity
+            engine.run_each(k.move_pairs, u, chords.touched, np.int32(t.n), *given)

@@ -221,7 +221,7 @@ class Domain(ClipBox):
     @property
     def may_have_parts(self) -> bool:
         """Whether ranks can share a mesh of it."""
-        return not self.cuts_cells and self.borders is None and self.wall_triangles is None
+        return self.borders is None and self.wall_triangles is None
 
     @property
     def sheets(self) -> Sheets | None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+import threading
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from itertools import pairwise
@@ -39,6 +40,8 @@ _ROUNDINGS = 8
 
 FEW_CELLS = 30
 """Pieces that fewer cells would fill do not meet their sizes."""
+_LINES = threading.Lock()
+"""Held while lines are compared with prepared shapes, which threads must not do at the same time."""
 BOUNDARY_SHIFTS = (8, 16, 32, 64, 64, 64, 64, 64)
 """Shifts of the boundary in units of round-off, each in another direction. They are tried one after the other if the
 boundary cannot be traced through the diagram. They are within the tolerance of vertices."""
@@ -521,6 +524,8 @@ class Polygon(Domain):
         """The domain as a shapely Polygon or MultiPolygon, prepared."""
         whole = self.pieces[0] if self.n_pieces == 1 else shapely.MultiPolygon(self.pieces)
         shapely.prepare(whole)
+        # The second question makes an index, which threads must not do at the same time.
+        shapely.intersects_xy(whole, *self.vertices[:3].T)
         return whole
 
     @property
@@ -680,9 +685,9 @@ class Polygon(Domain):
 
     def sees(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
         """Return which segments from `a` (k, 1, 2) to `b` (k, m, 2) lie in the polygon, (k, m)."""
-        shapely.prepare(self.geometry)
         ends = np.stack(np.broadcast_arrays(a, b), axis=2)
-        return np.asarray(shapely.covers(self.geometry, shapely.linestrings(ends)))
+        with _LINES:
+            return np.asarray(shapely.covers(self.geometry, shapely.linestrings(ends)))
 
     def stations(self, size: Callable[[np.ndarray], np.ndarray], free: Domain, fixed: np.ndarray) -> FixedGenerators:
         """Return generators around re-entrant corners; see `place_around_corners`."""

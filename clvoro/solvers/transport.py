@@ -118,7 +118,7 @@ class Transport:
         if now is None or not now.least > 0:
             now = evaluate(engine.zeros(n))
         assert now is not None
-        if fit_components(power.domain, now.t, prescribed):
+        if fit_components(engine, power.domain, now.t, prescribed):
             now = evaluate(now.weights)
             assert now is not None
         least = 0.5 * min(least, now.least)
@@ -127,7 +127,7 @@ class Transport:
         while now.error > tolerance and len(newton.shares) < max_steps:
             # Trial steps overwrite the diagram.
             self._rows = NeighborRows.copy_of(now.t)
-            balance_components(power.domain, now.t, now.rhs, prescribed)
+            balance_components(engine, power.domain, now.t, now.rhs, prescribed)
             step, newton.solution = self._newton_step(power, now, points, ordering)
             new, share = None, 2.0
             while new is None and share > LEAST_SHARE:

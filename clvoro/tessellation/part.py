@@ -188,7 +188,7 @@ class Part:
         given = (t.starts, t.neighbors, self.labels, t.sites, *self.box.clip_args(engine), *t.vertices[:1])
         reach = engine.scratch(t.n, np.float32) if t.reach is None else t.reach
         measures = t.face_measures, t.face_centroids, t.volumes, t.offsets, t.covariances, reach
-        order = engine.kernels("tessellation/row_order", defines, shared=True).order_rows
+        order = engine.kernels("tessellation/row_order", {**defines, "BY_PLACE": 1}, shared=True).order_rows
         engine.run_each(order, t.n, *given, *measures, *(engine.period_args if t.vertices else ()))
 
     def measure_faces(self, engine: Engine, t: Tessellation, defines: dict[str, object]) -> Tessellation:
@@ -213,22 +213,26 @@ class Part:
         with_ghosts: bool,
         needed: cla.Array,
         periods: np.ndarray,
+        slots: cla.Array | None = None,
     ) -> np.ndarray:
         """Return sums over own cells that prove, with those of all parts, that `t` is a part of the whole diagram.
 
         Parameters
         ----------
-        at, limits : (n_own, d) real, (n_own, 2) float32
+        at, limits : (rows, d) real, (rows, 2) float32
             Of each generator an earlier position, the radius around it within which all generators are known, and how
             far the generator may move from it.
         factor : float
             Radius of the ball in which all generators must be known, over the reach of a cell.
         with_ghosts : bool
             Whether the cells of ghosts beside own cells must be final, too.
-        needed : (n_own,) float32
+        needed : (rows,) float32
             Receives the radii of the balls around own generators in which all generators must be known.
         periods : (4,) real
             Lengths of the periods; 0 between walls.
+        slots : (count,) int32, optional
+            Where a boundary cuts cells; see `Chords`. The cells of ghosts that it crosses must then be final, too:
+            `rows` is `count`, otherwise `n_own`.
 
         Returns
         -------
@@ -241,7 +245,8 @@ class Part:
         given = t.starts, t.neighbors, self.labels, t.face_measures, t.volumes
         limited = np.int32(with_ghosts), engine.real.type(factor), t.reach, self.points, at, limits, needed, periods
         kernel = engine.kernels("tessellation/part", shared=True).sum_cells
-        engine.run_each(kernel, SUMS, np.int32(self.n_own), *given, *limited, sums)
+        rows = (self.n_own, t.starts) if slots is None else (self.count, slots)
+        engine.run_each(kernel, SUMS, np.int32(self.n_own), np.int32(rows[0]), rows[1], *given, *limited, sums)
         return sums.get().sum(axis=0, dtype=float)
 
     def forward(self, engine: Engine, *values: cla.Array, sums: PartialSums | None = None) -> np.ndarray:

@@ -14,6 +14,7 @@ again.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache
 from itertools import product
@@ -27,6 +28,7 @@ from ..errors import ClvoroError
 from ..geometry.domain import Domain
 from ..opencl.device_array import buffer_of
 from ..opencl.primitives import NamedArrays
+from .clipped.cut import Cut
 from .cut_cells import CutCells
 from .decomposition import hilbert_keys
 from .device_diagram import Follow, Tessellation
@@ -41,6 +43,10 @@ FIRST_REACH = {(3, 3): 1.9, (2, 2): 3.3, (3, 2): 2.4}
 """Radius of the first balls over the spacing of the generators around, by the dimensions of space and cells. Where
 cells have two, those of neighboring ghosts must be final, too. On a sphere the spacing is overestimated: bins are cubes
 in space."""
+BOUNDARY_REACH = 2.4
+"""The same for cells that a boundary cuts, in all parts."""
+LAST_LABEL = 2**31 - 1
+"""Label of the first ghost generator outside of a polygon; the others have those before it."""
 RUN = 32
 """Number of successive generators from which their spacing is estimated."""
 JUMP = 8
@@ -63,8 +69,9 @@ MOST_GHOSTS = 0.5
 cells are beside ghosts."""
 GROUP = 64
 """Number of balls in each group of the balls that another part has sent."""
-FAILED = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
-"""Summands of a part whose update has failed: zeros for those of `Part.sums`, and 1 for the number of failed parts."""
+FAILED = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0])
+"""Summands of a part whose update has failed: zeros for those of `Part.sums`, 1 for the number of failed parts, and the
+attempt to trace the boundary of a polygon."""
 
 
 @cache
@@ -118,6 +125,16 @@ class Chunks:
         self.firsts = np.unique(np.concatenate([np.arange(count) * n // count, jumps]))
         self.groups = np.empty(n, np.int32)
         self.groups[self.order] = np.repeat(np.arange(len(self.firsts)), np.diff(np.append(self.firsts, n)))
+
+    def joined(self, points: np.ndarray) -> Chunks:
+        """Return these chunks and those of further `points` (k, d)."""
+        if not len(points):
+            return self
+        found = Chunks(points, float(self.spacings.min()))
+        found.order = np.concatenate([self.order, len(self.order) + found.order])
+        found.groups = np.concatenate([self.groups, len(self.firsts) + found.groups])
+        found.firsts = np.concatenate([self.firsts, len(self.order) + found.firsts])
+        return found
 
 
 class BallGroups:
@@ -208,6 +225,8 @@ class Answers:
 
     Attributes
     ----------
+    rows : (k,) int
+        Rows of this part that have balls: its own generators, and ghosts at a boundary that cuts cells.
     balls : BallGroups
         Those of this part.
     asked : (m,) int
@@ -221,6 +240,7 @@ class Answers:
         positions (of the image, in a periodic box), and the number of the image.
     """
 
+    rows: np.ndarray
     balls: BallGroups
     asked: np.ndarray
     facing: dict[int, Facing]
@@ -290,8 +310,16 @@ class PartSteps(DomainSteps):
         How often parts have asked each other for ghosts.
     """
 
-    def __init__(self, stages: TessellationStages, domain: Domain) -> None:
+    def __init__(
+        self,
+        stages: TessellationStages,
+        domain: Domain,
+        spacing: Callable[[np.ndarray], np.ndarray] | None = None,
+        straight: bool = False,
+    ) -> None:
         super().__init__(stages, domain)
+        self._cut = None if domain.outline is None else Cut(stages, domain.outline, spacing, straight)
+        self._straight = straight
         self.peers, self.rounds, self.asked = stages.engine.peers, 0, 0
         real = stages.engine.real
         periods, self._periods = domain.periods(real), np.zeros(4, real)
@@ -325,12 +353,12 @@ class PartSteps(DomainSteps):
         labels, engine = self._given, self.stages.engine
         self.rounds += 1
         if self.peers.count == 1 and not self.is_periodic:
-            return Part(n, n, sites, self.box, None, labels=labels)
+            return self._with_outside(Part(n, n, sites, self.box, None, labels=labels))
         begins = self._labels is not labels
         if begins:
             self._begin_anew(sites[:n].get().astype(float), labels)
         count = n + len(self._rows)
-        points = self._room("points", size=count * engine.dim).reshape(count, -1)
+        points = self._room("points", size=(count + self._n_outside) * engine.dim).reshape(-1, engine.dim)
         if self.is_periodic:
             # Generators stay beside their neighbors when they cross a seam.
             own = self._room("own", size=n * engine.dim)
@@ -344,7 +372,29 @@ class PartSteps(DomainSteps):
             self._ghosts.shift(engine, n, self._periods, points)
         if self._at is None:
             self._note(points)
-        return Part(n, count, points, self.box, self._ghosts, labels=self._all_labels)
+        return self._with_outside(Part(n, count, points, self.box, self._ghosts, labels=self._all_labels))
+
+    @property
+    def _n_outside(self) -> int:
+        """Number of ghost generators outside of a polygon, the last rows of a part while its cells are made."""
+        return 0 if self._cut is None else len(self._cut.outside)
+
+    def _with_outside(self, part: Part) -> Part:
+        """Return `part` with the ghost generators outside of a polygon."""
+        if self._cut is None or not self._n_outside:
+            return part
+        engine, count = self.stages.engine, part.count + self._n_outside
+        points = part.points
+        if part.ghosts is None:
+            points = self._room("points", size=count * engine.dim).reshape(count, -1)
+            cl.enqueue_copy(
+                engine.queue, buffer_of(points), buffer_of(part.points), byte_count=part.points[: part.count].nbytes
+            )
+        engine.send(self._cut.outside, points, part.count * engine.dim * engine.real.itemsize)
+        labels = self._room("labels", size=count, dtype=np.int32)
+        cl.enqueue_copy(engine.queue, buffer_of(labels), buffer_of(part.labels), byte_count=4 * part.count)
+        engine.send(LAST_LABEL - np.arange(self._n_outside, dtype=np.int32), labels, 4 * part.count)
+        return replace(part, count=count, points=points, labels=labels)
 
     def _begin_anew(self, x: np.ndarray, labels: cla.Array) -> None:
         """Ask for the ghosts of new generators."""
@@ -352,37 +402,51 @@ class PartSteps(DomainSteps):
         self._labels, self._chunks = labels, Chunks(x, least)
         self._sent = [np.empty(0, np.int32) for _ in range(self.peers.count * len(self._shifts))]
         self._sides, self._rows = np.empty(0, int), np.empty(0, np.int32)
-        self._share_landmarks(x)
         self._caps = FIRST_REACH[self.domain.dim, self.domain.cell_dim] * self._chunks.spacings
+        x = np.concatenate([x, self._share_landmarks(x)])
         answers = self._ask(x, self._caps, self._caps)
         self._take(answers)
         self._limit(answers)
         self._store()
 
-    def _share_landmarks(self, x: np.ndarray) -> None:
-        """Give the generators nearest to the landmarks of the domain to all parts; own ones are at `x` (n, d)."""
-        places = self.domain.place(self.domain.landmarks, self.stages.engine.real)
+    def _share_landmarks(self, x: np.ndarray) -> np.ndarray:
+        """Give the generators nearest to the landmarks to all parts; own ones are at `x` (n, d).
+
+        Return the positions of those of other parts.
+        """
+        if self._cut is None:
+            places = self.domain.place(self.domain.landmarks, self.stages.engine.real)
+            spacings = np.zeros(len(places))
+        else:
+            places, spacings = self._cut.landmarks()
         if not len(places):
-            return
-        squares, nearest = (x * x).sum(axis=1), np.tile((np.inf, 0.0), (len(places), 1))
-        for k, place in enumerate(places if len(x) else ()):
-            ways2 = squares - 2 * (x @ place)
-            nearest[k] = ways2.min(), ways2.argmin()
-        found = np.array(self.peers.gather(nearest))
+            return x[:0]
+        nearest = np.full((len(places), 2 + x.shape[1]), np.inf)
+        if len(x):
+            away, rows = scipy.spatial.cKDTree(x).query(places)
+            nearest = np.column_stack([away, rows, x[rows]])
+        found, told = np.array(self.peers.gather(nearest)), [x[:0]]
         owners = found[:, :, 0].argmin(axis=0)
         for number in np.unique(owners):
-            rows = np.unique(found[number, owners == number, 1]).astype(np.int32)
+            mine = owners == number
+            rows, first, which = np.unique(found[number, mine, 1], return_index=True, return_inverse=True)
+            rows, radii = rows.astype(np.int32), np.zeros(len(rows))
+            np.maximum.at(radii, which.ravel(), BOUNDARY_REACH * spacings[mine])
             if number == self.peers.number:
                 self._sent = [known if k == number else rows for k, known in enumerate(self._sent)]
             else:
                 self._sides = np.concatenate([self._sides, np.full(len(rows), number)])
                 self._rows = np.concatenate([self._rows, rows])
+                self._caps = np.concatenate([self._caps, radii])
+                told.append(found[number, mine, 2:][first])
+        return np.concatenate(told)
 
     def _store(self) -> None:
         """Upload the lists of ghosts, and get their labels from their owners."""
-        engine, n, ways = self.stages.engine, len(self._caps), len(self._shifts)
+        engine, n, ways = self.stages.engine, len(self._chunks.spacings), len(self._shifts)
         order = np.argsort(self._sides, kind="stable")
         self._sides, self._rows = self._sides[order], self._rows[order]
+        self._caps[n:], self._limits[n:] = self._caps[n:][order], self._limits[n:][order]
         parts, way = np.divmod(self._sides, ways)
         # This part is on the opposite side of the other part.
         sent = [np.concatenate(self._sent[k : k + ways][::-1]) for k in range(0, len(self._sent), ways)]
@@ -395,7 +459,7 @@ class PartSteps(DomainSteps):
 
     def _note(self, points: cla.Array) -> None:
         """Keep the positions of own generators, at which the limits hold, and upload the limits."""
-        engine, n = self.stages.engine, len(self._caps)
+        engine, n = self.stages.engine, len(self._limits)
         self._at = self._room("at", size=n * engine.dim).reshape(n, engine.dim)
         cl.enqueue_copy(engine.queue, buffer_of(self._at), buffer_of(points), byte_count=self._at.nbytes)
         # Single precision must not round limits up.
@@ -417,6 +481,10 @@ class PartSteps(DomainSteps):
         before = previous.whole or previous
         if before.part is not None and before.part.ghosts is not part.ghosts:
             return None
+        if before.trimmed is not None:
+            before = before.trimmed.convex
+            if before.n != part.count:
+                return None
 
         def clip(cells: Polyhedra, cut: CutCells, report: cla.Array, _: int) -> None:
             binned = stages.bins.build(self.box, part.points, part.count)
@@ -438,25 +506,44 @@ class PartSteps(DomainSteps):
 
     def _finished(self, part: Part, t: Tessellation | None) -> Tessellation | None:
         """Return the diagram of own cells; None if ghosts were missing, or if a part has no diagram `t`."""
-        engine, n, sums = self.stages.engine, part.n_own, FAILED
-        if part.ghosts is None:
-            return None if t is None else replace(t, part=part)
-        needed = engine.scratch(n, np.float32)
-        if t is not None:
-            assert self._at is not None
-            given = self._at, self._limits_there, 2 * (1 + NOISE[engine.real.name]), self._reads_rows, needed
-            sums = np.append(part.sums(engine, t, *given, self._periods), 0)
-        sums = self.peers.total(sums)
-        if sums[-1] or t is None:
-            return None
-        if sums[3] and not self._ask_again(part, needed.get().astype(float)):
-            return None
+        engine, n = self.stages.engine, part.n_own
+        attempt, sums = 0, FAILED
+        if outside := self._n_outside:
+            count = part.count - outside
+            part = replace(part, count=count, points=part.points[:count], labels=part.labels[:count])
+        while True:
+            cells = t
+            if t is not None and self._cut is not None:
+                cells = self._cut.finish_updated(t, part.points, part.count, attempt)
+            if part.ghosts is None:
+                return None if cells is None else replace(cells, part=part)
+            needed = engine.scratch(n if self._cut is None else part.count, np.float32)
+            if cells is not None:
+                assert self._at is not None
+                given = self._at, self._limits_there, 2 * (1 + NOISE[engine.real.name]), self._reads_rows, needed
+                slots = None if cells.trimmed is None else cells.trimmed.chords.slots
+                tried = 0 if self._cut is None else self._cut.attempt
+                sums = np.append(part.sums(engine, cells, *given, self._periods, slots), [0, tried])
+            sums = self.peers.total(sums)
+            if sums[5] or cells is None:
+                return None
+            if sums[3] and not self._ask_again(part, needed.get().astype(float)):
+                return None
+            if not sums[6]:
+                break
+            # All parts trace the boundary at the same place.
+            attempts = np.array(self.peers.gather(np.array(tried)))
+            if (attempts == (attempt := int(attempts.max()))).all():
+                break
+        t = cells
         if sums[4]:
             raise FewCellsError(
                 f"{int(sums[4])} neighbors of generators are half a period away or farther, expected at least four or "
                 f"five cells across each period of {self.domain}; use a smaller size, more cells (n_cells) or fewer "
                 "levels"
             )
+        if self._straight and self._cut is not None:
+            sums[0] = self._measure
         self._check(*sums[:3])
         whole = t if t.n == part.count else None
         own, points = t.first(n) if t.n > n else t, part.points
@@ -464,6 +551,16 @@ class PartSteps(DomainSteps):
             points = self._room("placed", size=points.size).reshape(points.shape)
             part.place_unfolded(engine, self._periods, points)
         return replace(own, part=part, whole=whole, points=points, sites=part.points)
+
+    def measure_exactly(self, t: Tessellation) -> Tessellation:
+        """Return `t` with the measures of cells up to the boundary, and check that they fill the domain."""
+        if self._cut is None or not self._straight:
+            return t
+        made = self._cut.measure_exactly(t.whole or t)
+        self._check(float(self.peers.total(made.volumes[: t.n].get().sum(dtype=float))), 0, 1)
+        if t.whole is None:
+            return replace(made, part=t.part)
+        return replace(made.first(t.n), part=t.part, whole=made, points=t.points, sites=t.sites)
 
     def _check(self, volume: float, gap: float, faces: float) -> None:
         """Raise if the cells of all parts do not fill the domain, or a face between two parts has only one side."""
@@ -475,8 +572,16 @@ class PartSteps(DomainSteps):
             )
 
     def _ask_again(self, part: Part, needed: np.ndarray) -> bool:
-        """Ask for the ghosts in balls of radii `needed` (n,). Return False if there are new ones."""
-        x = part.points[: part.n_own].get().astype(float)
+        """Ask for the ghosts in balls of radii `needed` (k,) around the first k rows.
+
+        Return False if there are new ones.
+        """
+        n, x = part.n_own, part.points[: len(needed)].get().astype(float)
+        fresh = n + np.flatnonzero((needed[n:] > 0) & (self._caps[n : len(needed)] == 0))
+        if len(fresh):
+            # The boundary crosses further cells.
+            self._caps[fresh] = BOUNDARY_REACH * scipy.spatial.cKDTree(x).query(x[fresh], k=2)[0][:, 1]
+        needed = np.append(needed, np.zeros(len(self._caps) - len(needed)))
         while True:
             # A cell without the ghosts around it may reach through the whole domain.
             radii = np.maximum(self._caps, np.minimum(GROWTH * needed, 2 * self._caps))
@@ -495,17 +600,19 @@ class PartSteps(DomainSteps):
                 return True
 
     def _ask(self, x: np.ndarray, radii: np.ndarray, needed: np.ndarray) -> Answers:
-        """Ask for the generators in balls around own generators.
+        """Ask for the generators in balls around own generators, and around some ghosts.
 
         Parameters
         ----------
         x : (n, d) float
-            Positions of the generators.
+            Positions of the first rows.
         radii, needed : (n,) float
-            Radii of the balls to ask for, and of the balls that the present cells need.
+            Radii of the balls to ask for, and of the balls that the present cells need; 0 for no ball.
         """
         self.asked += 1
-        peers, balls, ways = self.peers, BallGroups(x, radii, self._chunks), len(self._shifts)
+        all_rows, n = np.flatnonzero(radii), len(self._chunks.spacings)
+        x, radii, needed = x[all_rows], radii[all_rows], needed[all_rows]
+        peers, balls, ways = self.peers, BallGroups(x, radii, self._chunks.joined(x[n:])), len(self._shifts)
         told, facing = peers.exchange([balls.facts] * peers.count), {}
         for side in range(len(self._sent)):
             number, way = divmod(side, ways)
@@ -526,7 +633,7 @@ class PartSteps(DomainSteps):
                 given[opposite] = rows
                 answers.append(np.column_stack([rows, inside(places, balls_there[:, :-1]), places + shift]))
             sent += self._joined(answers)
-        return Answers(balls, np.unique(np.concatenate(asked)), facing, given, peers.exchange(sent))
+        return Answers(all_rows, balls, np.unique(np.concatenate(asked)), facing, given, peers.exchange(sent))
 
     def _joined(self, tables: list[np.ndarray]) -> list[np.ndarray]:
         """Join the tables of all sides of each part to one array, whose last column is the number of the image."""
@@ -540,10 +647,12 @@ class PartSteps(DomainSteps):
         sides = [len(self._shifts) * number + rows[:, -1].astype(int) for number, rows in enumerate(answers.new)]
         rows = np.concatenate([rows[:, 0] for rows in answers.new]).astype(np.int32)
         self._sides, self._rows = np.concatenate([self._sides, *sides]), np.concatenate([self._rows, rows])
+        self._caps = np.append(self._caps, np.zeros(len(rows)))
 
     def _limit(self, answers: Answers) -> None:
-        """Set the limits of own generators."""
-        self._limits, self._at = np.column_stack(self._limits_of(answers.balls, answers.facing)), None
+        """Set the limits of own generators, and of ghosts that have balls."""
+        self._limits, self._at = np.zeros((len(self._caps), 2)), None
+        self._limits[answers.rows] = np.column_stack(self._limits_of(answers.balls, answers.facing))
 
     def _unknown(self, own: BallGroups, balls: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the own generators in `balls` (m, d + 2) that are not among the `known` ones, and their positions.
@@ -558,7 +667,7 @@ class PartSteps(DomainSteps):
         lower = np.minimum.reduceat(balls[:, :dim] - balls[:, dim:], firsts, axis=0)
         groups = np.hstack([lower, np.maximum.reduceat(balls[:, :dim] + balls[:, dim:], firsts, axis=0)])
         near = (gaps(own.boxes, groups) <= 0).any(axis=1)[own.chunks.groups]
-        near[known] = False
+        near[known] = near[len(self._chunks.spacings) :] = False
         rows = np.flatnonzero(near)
         places = own.centers[rows]
         found = inside(places, balls)

@@ -66,7 +66,7 @@ class Tessellator:
         self.stages = stages.weighted if weighted else stages
         if stages.engine.peers.shared:
             self.stages = self.stages.unfolded
-            self.steps: DomainSteps = PartSteps(self.stages, domain)
+            self.steps: DomainSteps = PartSteps(self.stages, domain, spacing, straight)
         elif any(domain.periodic):
             halo = None if coarser is None else coarser.steps.halo
             self.steps = Images(self.stages, domain, halo)

@@ -92,6 +92,11 @@ for name, options in {"whole": ["--no-report"], "pieces": pieces, "missing": [],
     case = f"{folder}/{'missing' if name == 'missing' else 'box'}.toml"
     print(name, main(["run", case, "--out", f"{folder}/{name}", *options]), end=" ", file=out)
 """
+LAKE = clvoro.Polygon(
+    [(0, 0), (1, 0), (1, 0.4), (0.6, 0.5), (1, 0.6), (1, 1), (0, 1)],
+    [[(0.3, 0.3), (0.4, 0.3), (0.35, 0.45)], [(0.2, 0.7), (0.5, 0.72), (0.5, 0.725), (0.2, 0.74)]],
+)
+"""With a concave corner, an island and a thin wall."""
 CASE = """
 [domain]
 lower = [0.0, 0.0]
@@ -125,23 +130,29 @@ def ramp(h):
 
 
 @pytest.mark.sparse(3)
-@pytest.mark.parametrize("kind", ["walls", "periodic", "sphere"])
+@pytest.mark.parametrize(
+    ("dim", "kind"), [(2, "walls"), (3, "walls"), (2, "periodic"), (3, "periodic"), (3, "sphere"), (2, "polygon")]
+)
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
-@pytest.mark.parametrize("dim", [2, 3])
 def test_the_diagram_has_the_same_bits_in_any_number_of_parts(ctx, dim, dtype, kind):
     """Clusters of very different density, so that balls reach far: ghosts are enough, or bits differ.
 
     The whole of a periodic box is made anew from the generators, but its errors and qualities come from the parts. On a
-    sphere most parts have generators on one side only.
+    sphere most parts have generators on one side only. In a polygon each part traces the whole boundary; the whole is
+    made anew, too, in one part.
     """
     rng, periodic = np.random.default_rng(70101), kind == "periodic"
-    dim = 3 if kind == "sphere" else dim
     x = np.concatenate([rng.random((150, dim)), (0.3 + 0.02 * rng.standard_normal((150, dim))) % 1])
     box = clvoro.Box((0,) * dim, (1,) * dim, periodic=(periodic, periodic, False)[:dim])
-    given = clvoro.Sphere(2) if kind == "sphere" else box, 0.1
+    given = {"sphere": clvoro.Sphere(2), "polygon": LAKE}.get(kind, box), 0.1
     x[:150] -= 0.5 if kind == "sphere" else 0
+    x = x[LAKE.contains(x)] if kind == "polygon" else x
     options = {"points": x.astype(dtype), "method": "lloyd", "max_steps": 0, "dtype": dtype}
-    meshes = [run_in(parts, ctx, *given, **options)[1] for parts in (1, 2, 4)]
+    runs = [run_in(parts, ctx, *given, **options) for parts in (1, 2, 4)]
+    meshes = [whole for _, whole in runs]
+    for part in runs[2][0]:
+        rows = np.searchsorted(np.sort(np.concatenate([mesh.parts.labels for mesh in runs[2][0]])), part.parts.labels)
+        assert periodic or np.array_equal(part.volumes, meshes[2].volumes[rows])
     plain = clvoro.Adapter(ctx, dtype).diagram(given[0], options["points"])
     assert np.allclose(meshes[0].volumes, plain.volumes, rtol=1e-3 if dtype == "float32" else 1e-9)
     for mesh in meshes[1:]:
@@ -149,10 +160,10 @@ def test_the_diagram_has_the_same_bits_in_any_number_of_parts(ctx, dim, dtype, k
             assert np.array_equal(getattr(mesh, name), getattr(meshes[0], name)), name
 
 
-@pytest.mark.parametrize("dim", [2, 3])
-def test_steps_have_the_same_bits_in_any_number_of_parts(ctx, dim, monkeypatch):
-    """Generators move by Lloyd's algorithm, across a seam, too. Cells are made anew at first, and updated later."""
-    updated, update = [], PartSteps.update
+@pytest.mark.parametrize("kind", ["plane", "space", "polygon"])
+def test_steps_have_the_same_bits_in_any_number_of_parts(ctx, kind, monkeypatch):
+    """Generators move by Lloyd's algorithm, in boxes across a seam. Cells are made anew at first, and updated later."""
+    updated, update, dim = [], PartSteps.update, 3 if kind == "space" else 2
 
     def noted(steps, *given):
         found = update(steps, *given)
@@ -163,6 +174,8 @@ def test_steps_have_the_same_bits_in_any_number_of_parts(ctx, dim, monkeypatch):
     monkeypatch.setattr(part_steps, "MOST_GHOSTS", 2)
     box = clvoro.Box((0,) * dim, (6, *[1] * (dim - 1)), periodic=(True, *[False] * (dim - 1)))
     x = np.random.default_rng(70102).random((800, dim)) * box.extent
+    if kind == "polygon":
+        box, x = LAKE, x[LAKE.contains(x * 0.2)] * 0.2
     one, two, three = (
         run_in(parts, ctx, box, 0.1, points=x, method="lloyd", max_steps=2 * dim + 4)[1] for parts in (1, 2, 3)
     )
@@ -170,7 +183,7 @@ def test_steps_have_the_same_bits_in_any_number_of_parts(ctx, dim, monkeypatch):
     for mesh in (two, three):
         for name in ("points", "neighbors", "size_error", "quality"):
             assert np.array_equal(getattr(mesh, name), getattr(one, name)), name
-    assert np.abs(one.points[:, 0] - x[:, 0]).max() > 5
+    assert kind == "polygon" or np.abs(one.points[:, 0] - x[:, 0]).max() > 5
 
 
 def test_a_run_in_parts_of_a_periodic_box(ctx, tmp_path):
@@ -198,7 +211,7 @@ def test_a_run_in_parts_of_a_periodic_box(ctx, tmp_path):
     ].check()
 
 
-@pytest.mark.parametrize("kind", ["plane", "space", "sphere"])
+@pytest.mark.parametrize("kind", ["plane", "space", "sphere", "polygon"])
 def test_a_run_in_parts(ctx, kind, tmp_path, monkeypatch):
     """Each part has its own cells, in balance; the whole has the sizes and shapes of a run without parts.
 
@@ -206,14 +219,16 @@ def test_a_run_in_parts(ctx, kind, tmp_path, monkeypatch):
 
     ParaView's library reads the pieces of all parts as one mesh.
     """
-    dim = 2 if kind == "plane" else 3
-    domain = clvoro.Sphere(0.5) if kind == "sphere" else clvoro.Box((0,) * dim, (1,) * dim)
-    given = domain, ramp({"plane": 0.05, "space": 0.1, "sphere": 0.1}[kind])
+    dim = 2 if kind in ("plane", "polygon") else 3
+    domain = {"sphere": clvoro.Sphere(0.5), "polygon": LAKE}.get(kind, clvoro.Box((0,) * dim, (1,) * dim))
+    given = domain, ramp({"plane": 0.05, "polygon": 0.03}.get(kind, 0.1))
     few = clvoro.MultilevelOptions(levels=1 if kind == "sphere" else 2)
-    alone = clvoro.Adapter(ctx).run(*given, effort="fast", options=few)
+    wells = [(0.25, 0.25)] if kind == "polygon" else None
+    alone = clvoro.Adapter(ctx).run(*given, effort="fast", options=few, fixed=wells)
     monkeypatch.setattr(run, "PART_CELLS", len(alone) / 2**domain.cell_dim / 2.5)
-    meshes, whole = run_in(3, ctx, *given, effort="fast", options=few, path=tmp_path)
+    meshes, whole = run_in(3, ctx, *given, effort="fast", options=few, fixed=wells, path=tmp_path)
     assert whole.check()
+    assert wells is None or np.array_equal(whole.points[0], wells[0])
     assert whole.history["level"][0] == few.levels
     for name in set(whole.history.dtype.names) - {"seconds"}:
         assert all(np.array_equal(mesh.history[name], whole.history[name]) for mesh in meshes), name
@@ -243,7 +258,8 @@ def test_a_run_in_parts(ctx, kind, tmp_path, monkeypatch):
 
     owners = np.loadtxt(tmp_path / "graph.info.part.3", int)
     assert np.array_equal(owners, np.repeat(range(3), sizes)[np.argsort(labels_by_part, kind="stable")])
-    assert (tmp_path / "graph.info").read_text().split()[:2] == [str(len(whole)), str(whole.faces.n_inner)]
+    pairs = np.unique(np.sort([whole.half_faces.owner, whole.neighbors], axis=0)[:, whole.neighbors >= 0], axis=1)
+    assert (tmp_path / "graph.info").read_text().split()[:2] == [str(len(whole)), str(pairs.shape[1])]
     for number, size in enumerate(sizes if kind != "sphere" else ()):
         cells = tmp_path / f"case/processor{number}/constant/polyMesh/cellProcAddressing"
         assert f"\n{size}\n(" in cells.read_text()
@@ -309,7 +325,7 @@ def test_parts_hold_what_one_device_does_not(ctx, monkeypatch):
 
 def test_checkpoints_are_resumed_on_any_number_of_parts(ctx, tmp_path, monkeypatch):
     """On as many parts with the same bits; a piece that one part cannot write leaves the last checkpoint whole."""
-    given, state = (clvoro.Box((0, 0), (1, 1)), ramp(0.1)), tmp_path / "state"
+    given, state = (LAKE, ramp(0.08)), tmp_path / "state"
     short = {"effort": "fast", "max_steps": 16}
     options = {**short, "checkpoint": clvoro.Checkpoint(state, 0)}
     whole = run_in(2, ctx, *given, **options)[1]
@@ -423,10 +439,11 @@ def test_threads_end_together():
     assert team.run(lambda peers: int(peers.before(2))) == [0, 2, 4]
 
 
-@pytest.mark.parametrize("change", [{"method": "transport"}, {"fixed": [(0.5, 0.5)]}])
-def test_what_ranks_cannot_share_is_refused(ctx, change):
+@pytest.mark.parametrize("domain", [clvoro.Box((0, 0), (1, 1)), LAKE])
+@pytest.mark.parametrize("change", [{"method": "transport"}, {"layers": clvoro.Layers(0.1)}])
+def test_what_ranks_cannot_share_is_refused(ctx, domain, change):
     with pytest.raises(InputError, match="devices share the run"):
-        run_in(1, ctx, clvoro.Box((0, 0), (1, 1)), 0.2, **change)
+        run_in(1, ctx, domain, 0.2, **change)
     with pytest.raises(InputTypeError, match="communicator"):
         clvoro.Adapter(ctx, comm=4)
     alone = Peers()

@@ -10,6 +10,7 @@ import shapely
 
 import clvoro
 from clvoro.errors import InputError, InputTypeError, MismatchWarning
+from clvoro.opencl.threads import Team
 from tests.reference.polygons import HOLE, OTHER, SQUARE, crossings, distances, ragged
 
 
@@ -138,6 +139,19 @@ def test_points_are_located() -> None:
     away = np.linalg.norm(nearest - x, axis=1)
     assert np.abs(away - np.where(inside, 0, distance)).max() < 4e-15
     assert domain.contains(nearest).all()
+
+
+def test_threads_locate_points_at_the_same_time() -> None:
+    """Those of several devices do: the indices of shapely are made before."""
+    angle, rng = np.linspace(0, 2 * np.pi, 4000, endpoint=False), np.random.default_rng(5)
+    x = rng.uniform(-1, 1, (400, 2))
+    for _ in range(10):
+        radius = 1 + 0.1 * np.sin(7 * angle) + 0.001 * rng.random(len(angle))
+        disc = clvoro.Polygon(radius[:, None] * np.column_stack([np.cos(angle), np.sin(angle)]))
+        found = Team(4).run(
+            lambda peers, disc=disc: (disc.covers(x).sum(), disc.sees(x[:99, None], x[1:100, None]).sum())
+        )
+        assert len(set(found)) == 1
 
 
 def test_the_boundary_belongs_to_the_domain() -> None:

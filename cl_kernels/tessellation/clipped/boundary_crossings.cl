@@ -25,7 +25,7 @@ inline REAL squared_distance(REAL2 y, int i, global const REAL *points)
    in i and j. Exact also where the distances from y differ by less than their round-off. */
 inline REAL beyond_bisector(REAL2 y, int i, int j, global const REAL *points)
 {
-    const int o = min(i, j), q = max(i, j);
+    const int o = FIRST_OF(i, j, points), q = o == i ? j : i;
     const REAL2 x = PLACE(points, o), d = PLACE(points, q) - x;
     const REAL s = beyond_face(y, x, d, o, q, points);
     return i == o ? s : -s;
@@ -55,7 +55,7 @@ kernel void find_boundary_owners(const int size, global const REAL2 *inner, glob
         for (int k = starts[cell]; k < starts[cell + 1]; ++k) {
             const int j = neighbors[k];
             const REAL d2 = j >= 0 ? squared_distance(y, j, points) : REAL_MAX;
-            if (d2 < least || (d2 == least && j < next)) {
+            if (d2 < least || (d2 == least && j != next && FIRST_OF(j, next, points) == j)) {
                 least = d2;
                 next = j;
             }
@@ -87,7 +87,7 @@ kernel void find_boundary_owners(const int size, global const REAL2 *inner, glob
 /* Parameter t at which the line a + t e meets the bisector of two generators; symmetric in the two. */
 inline REAL crossing(int i, int j, REAL2 a, REAL2 e, global const REAL *points)
 {
-    const int o = min(i, j), q = max(i, j);
+    const int o = FIRST_OF(i, j, points), q = o == i ? j : i;
     const REAL2 x = PLACE(points, o), d = PLACE(points, q) - x;
     return -beyond_face(a, x, d, o, q, points) / dot(e, d);
 }

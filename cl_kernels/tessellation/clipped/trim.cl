@@ -209,6 +209,16 @@ kernel void write_segments(const int size, CONVEX_ARGS, CHORD_ARGS, global const
     }
 }
 
+/* Per crossed cell: the reach of its pieces in the domain, in a part of the domain (part.cl). */
+kernel void limit_reach(const int size, SEGMENT_ARGS, global const int *touched, global float *reach)
+{
+    WORK_ITEM(u);
+    REAL far2 = 0;
+    for (int k = segment_starts[u]; k < segment_starts[u + 1]; ++k)
+        far2 = fmax(far2, fmax(dot(segment_p[k], segment_p[k]), dot(segment_q[k], segment_q[k])));
+    reach[touched[u]] = (float)sqrt(far2);
+}
+
 /* Per crossed cell: check that its pieces fit to the neighboring ones. All faces must have two sides and none may
    belong to a ghost generator; then the cells tile the domain. This fails where edges cross a face closer to each other
    than round-off. Check also that the generator keeps a piece. `n` generators are in the domain. */

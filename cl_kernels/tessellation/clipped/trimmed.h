@@ -64,7 +64,7 @@ typedef struct {
    both cells, except for the sign. */
 inline place_t crossing_place(const convex_t *cell, const chords_t *c, int chord, int j)
 {
-    const int edge = c->edges[chord], o = min(cell->i, j), q = max(cell->i, j);
+    const int edge = c->edges[chord], o = FIRST_OF(cell->i, j, cell->points), q = o == cell->i ? j : cell->i;
     const REAL2 x = PLACE(cell->points, o), d = PLACE(cell->points, q) - x, along = (REAL2)(-d.s1, d.s0);
     const REAL2 e = c->vertices[c->next_vertex[edge]] - c->vertices[edge];
     const REAL t = c->ends[chord], sign = cell->i == o ? 1 : -1;

@@ -56,6 +56,11 @@ class Chords:
     """The boundary, in the domain's unit of length."""
 
 
+def order_defines(engine: Engine) -> dict[str, object]:
+    """Return the macros for building kernels that must not depend on the numbers of generators, if parts share them."""
+    return {"BY_PLACE": 1} if engine.peers.shared else {}
+
+
 def inward_vectors(domain: Polygon, real: np.dtype) -> np.ndarray:
     """Return vectors (k, 2) from the vertices of `domain` inwards, between the edges, a few units of round-off long."""
     vertices, following = domain.oriented.vertices, domain.oriented.next_vertex
@@ -88,7 +93,7 @@ class Boundary:
         self.engine = engine
         # Counts change little between steps.
         self._scan, self._room = Scan(engine), NamedArrays(engine, spare=1 / 16)
-        self._kernels = engine.kernels("tessellation/clipped/boundary_crossings")
+        self._kernels = engine.kernels("tessellation/clipped/boundary_crossings", order_defines(engine))
         origin, scale = domain.frame
         self._rings = oriented = domain.oriented
         self.edges = len(oriented.vertices)

@@ -37,7 +37,7 @@ class Cut(DomainSteps):
     Parameters
     ----------
     spacing : callable or None
-        Distance of generators near points (k, 2) of the boundary, (k,); see `place_ghost_generators`. None: no ghost
+        Distance of generators near points (k, 2) of the boundary, (k,); see `graded_places`. None: no ghost
         generators. The diagram is the same, but slow to make where many generators surround a wide hole.
     straight : bool
         Measure cells with straight sides along the boundary, until `measure_exactly`; see `Trim.trim`.
@@ -55,10 +55,36 @@ class Cut(DomainSteps):
         self._boundary, self._polygon, self._straight = Boundary(engine, domain), domain, straight
         origin, scale = domain.frame
         self._spacing = spacing
-        found = np.empty((0, 2)) if spacing is None else place_ghost_generators(domain, spacing)
+        found = np.empty((0, 2)) if spacing is None else graded_places(domain, spacing)
         self._ghosts = ((found - origin) / scale).astype(engine.real)
-        self._removals = 0
+        self._removals = self.attempt = 0
         self._all: cla.Array | None = None
+
+    @property
+    def outside(self) -> np.ndarray:
+        """The ghost generators in the device's coordinates, (g, 2)."""
+        return self._ghosts
+
+    def landmarks(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return places (k, 2) along the boundary and all over the domain, in the device's coordinates.
+
+        All parts of a mesh know the generators nearest to them. Places along the boundary are half a cell apart; the
+        second array (k,) has the spacing of generators there, and 0 at the other places.
+        """
+        assert self._spacing is not None
+        (origin, scale), edges = self._polygon.frame, self._polygon.oriented
+        at, way = edges.vertices, edges.along
+        for _ in range(2):
+            h = np.asarray(self._spacing(at + way / 2), float)
+            counts = np.ceil(2 * np.hypot(*way.T) / h).clip(1).astype(int)
+            rows = np.repeat(np.arange(len(at)), counts)
+            place = np.arange(len(rows)) - np.repeat(np.cumsum(counts) - counts, counts)
+            way = way[rows] / counts[rows, None]
+            at = at[rows] + place[:, None] * way
+        inner = graded_places(self._polygon, self._spacing, inside=True)
+        h = np.asarray(self._spacing(at), float)
+        places = (np.concatenate([at, inner]) - origin) / scale
+        return places, np.concatenate([h / scale, np.zeros(len(inner))])
 
     def extend(self, sites: cla.Array, n: int) -> Part:
         """Return the first `n` of `sites` with the ghost generators."""
@@ -79,16 +105,18 @@ class Cut(DomainSteps):
         self._ghosts = self._ghosts[:0]
         return there
 
-    def finish_updated(self, t: Tessellation, points: cla.Array, n: int) -> Tessellation | None:
+    def finish_updated(self, t: Tessellation, points: cla.Array, n: int, first: int = 0) -> Tessellation | None:
         """Clip the convex diagram `t` by the boundary; None if ghost generators had to be removed.
+
+        `first` is the first attempt, and `attempt` the last one, which succeeds.
 
         Where many cells share a vertex that lies on a vertex of the boundary, their faces there are as short as
         round-off, and the tracing may fail. A boundary shifted by a few ulps crosses only one or two of these cells.
         """
         eps = float(np.finfo(self.stages.engine.real).eps)
         lost = BoundaryError()
-        for attempt, far in enumerate((0, *BOUNDARY_SHIFTS)):
-            angle, length = 2 * attempt, far * eps
+        for self.attempt, far in list(enumerate((0, *BOUNDARY_SHIFTS)))[first:]:
+            angle, length = 2 * self.attempt, far * eps
             shift = (length * math.cos(angle), length * math.sin(angle))
             try:
                 # The search for the vertices starts from the cells of the previous call.
@@ -126,8 +154,8 @@ class Cut(DomainSteps):
         return t
 
 
-def place_ghost_generators(domain: Polygon, spacing: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
-    """Return ghost generators (s, 2) outside `domain`, inside the box that clips its cells.
+def graded_places(domain: Polygon, spacing: Callable[[np.ndarray], np.ndarray], inside: bool = False) -> np.ndarray:
+    """Return ghost generators (s, 2) outside `domain`, inside the box that clips its cells; or such places `inside`.
 
     The convex cells of generators at the boundary reach far outside, up to the middle of a hole, and so does the search
     for their neighbors. Ghost generators bound these cells at little cost. They do not change the diagram inside the
@@ -150,7 +178,7 @@ def place_ghost_generators(domain: Polygon, spacing: Callable[[np.ndarray], np.n
         total += len(centers)
         nearest = domain.nearest_edge(centers)[1]
         distance = np.hypot(*(nearest - centers).T)
-        outside = ~domain.contains(centers)
+        outside = domain.contains(centers) == inside
         whole = distance > edge * np.sqrt(0.5)  # the boundary does not pass through the box
         clearance = CLEARANCE * np.asarray(spacing(nearest), float)
         small = edge <= distance / GRADING

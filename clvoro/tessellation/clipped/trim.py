@@ -12,7 +12,7 @@ from ...opencl.device_array import read_number
 from ...opencl.engine import Engine
 from ...opencl.primitives import NamedArrays, Scan
 from ..device_diagram import Tessellation
-from .boundary_crossings import LOST, BoundaryError, Chords
+from .boundary_crossings import LOST, BoundaryError, Chords, order_defines
 
 ORPHANS = 4
 """Flag of `trim.cl`: a cell has more than one piece."""
@@ -60,7 +60,7 @@ class Trim:
         self.engine = engine
         # Sizes change little from step to step.
         self._scan, self._room = Scan(engine), NamedArrays(engine, spare=1 / 16)
-        self._kernels = engine.kernels("tessellation/clipped/trim")
+        self._kernels = engine.kernels("tessellation/clipped/trim", order_defines(engine))
         # Flags of kernels, and the number of segments: the host reads both at once.
         self._flags = engine.empty(2, np.int32)
 
@@ -185,6 +185,9 @@ class Trim:
         rows = starts, neighbors, measures, centroids
         self._write_whole(convex, chords, found, rows, outlines)
         self._write_trimmed(points, convex, chords, found, (*rows, face_segments), outlines, straight)
+        if convex.reach is not None:
+            limit = self._kernels.limit_reach
+            self.engine.run_each(limit, chords.touched_count, *found.segments, chords.touched, convex.reach)
         return Tessellation(
             n=n,
             points=points,
@@ -195,6 +198,7 @@ class Trim:
             volumes=convex.volumes[:n],
             offsets=convex.offsets[:n],
             covariances=convex.covariances[:n],
+            reach=None if convex.reach is None else convex.reach[:n],
             outlines=(outlines, chords.tangents),
             trimmed=Trimmed(convex, chords, found.segments, face_segments, found.segment_count),
         )

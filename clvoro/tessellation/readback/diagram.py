@@ -449,7 +449,7 @@ class _DiagramReader:
         x = self._placed(np.take(self.t.points.get(), self.order, axis=0), within_seams=True)
         if self.cut is not None:
             # Round-off must not move a generator on the boundary out of the domain.
-            near = slice(None) if self.cut.shifted else self.ranks[self.cut.touched]
+            near = slice(None) if self.cut.shifted else self.ranks[self.cut.touched[self.cut.touched < self.n]]
             x[near] = self.domain.nearest(x[near])
         return x
 

@@ -87,6 +87,11 @@ def unfolded(domain: Domain) -> Domain:
     return found
 
 
+SINGLE = Peers()
+"""A run over a single rank."""
+SINGLE.shared = True
+
+
 @dataclass(frozen=True)
 class CellRows:
     """The cells of a part on the host, as the device has them; neighbors are labels.
@@ -142,13 +147,17 @@ class CellRows:
     def diagram(self, engine: Engine, domain: Domain) -> Diagram:
         """Return the diagram of these cells, if they are all of the domain, in the order of labels.
 
-        In a periodic box it is made anew, since vertices are those of cells on both sides of a seam.
+        In a periodic box it is made anew, since vertices are those of cells on both sides of a seam, and in a polygon,
+        since they are numbered by convex cells.
         """
-        if any(domain.periodic):
+        if any(domain.periodic) or domain.cuts_cells:
             engine = engine.replaced(traits=domain.traits(engine.real))
+            if domain.cuts_cells:
+                engine.peers = SINGLE  # the same bits as in parts
             points, tessellator = engine.upload(self.cells[0]), Tessellator(TessellationStages(engine), domain)
-            t = tessellator.tessellate(points, len(points), exact=True, complete=True)
-            return fetch_diagram(engine, domain, tessellator.final(t), engine.upload(np.arange(t.n), np.int32))
+            labels = engine.upload(np.arange(len(points)), np.int32)
+            t = tessellator.tessellate(points, len(points), exact=True, complete=True, labels=labels)
+            return fetch_diagram(engine, domain, tessellator.final(t), labels)
         neighbors, measures, centroids = self.faces
         rows = np.where(neighbors < 0, neighbors, np.searchsorted(self.labels, neighbors))
         points, volumes, offsets, covariances = (engine.upload(array, array.dtype) for array in self.cells)
