@@ -1,7 +1,7 @@
 """Flows in OpenFOAM on meshes of solids: cells of clvoro, tetrahedra of Gmsh, and their duals by polyDualMesh.
 
     python bench/solid_flows.py [--flows sphere,bend] [--cells 1000,4000,16000] [--meshers NAMES] [--keep FOLDER]
-                                [--pictures FOLDER] [--device NAME] [--json]
+                                [--device NAME] [--json]
 
 All meshers get the same triangulated surface and a uniform size, scaled to nearly the same number of cells. Rows have
 the processor time of the mesh, what `checkMesh` says of it, and the error of the flow.
@@ -12,7 +12,7 @@ are root mean squares of the velocity in cells over that of the stream: of all c
 bend: laminar flow through a bent pipe at Re 40 (`simpleFoam`), a parabola at the inlet. Errors are those of the loss of
 pressure, and of the velocity at 5,000 points, against a mesh of clvoro with --reference cells.
 
-Gmsh (pip install gmsh) and Debian's package openfoam are needed. Pictures show errors against cells.
+Gmsh, trimesh and shapely (pip install gmsh trimesh shapely) and Debian's package openfoam are needed.
 """
 
 from __future__ import annotations
@@ -27,9 +27,11 @@ from typing import Any
 
 import numpy as np
 import scipy
+import shapely
 from _common import Report, counts, heading, make_adapter, names, parser
 from _openfoam import Case, Mesh, nonuniform, require
 from solver_ready import figures_of
+from trimesh import creation
 
 import clvoro
 from clvoro.io.check_mesh import check_case
@@ -52,40 +54,15 @@ def around_sphere() -> clvoro.Solid:
 
 
 def bent_pipe() -> clvoro.Solid:
-    """Return a pipe that turns by 90 degrees; patches are inlet, outlet and wall."""
-    around, step = 72, 0.06
-    straight = np.linspace(0, STRAIGHT, round(STRAIGHT / step) + 1)
-    angle = np.linspace(0, math.pi / 2, round(BEND * math.pi / 2 / step) + 1)[1:-1]
-    axis = [
-        np.column_stack([straight - STRAIGHT, 0 * straight]),
-        BEND * np.column_stack([np.sin(angle), 1 - np.cos(angle)]),
-    ]
-    axis.append(np.column_stack([0 * straight + BEND, BEND + straight]))
-    turn = np.concatenate([0 * straight, angle, 0 * straight + math.pi / 2])
-    axis = np.concatenate(axis)
-    t = 2 * math.pi * np.arange(around) / around
-    aside = np.column_stack([-np.sin(turn), np.cos(turn)])
-    rings = axis[:, None] + RADIUS * np.cos(t)[:, None] * aside[:, None]
-    points = np.concatenate([rings, np.broadcast_to(RADIUS * np.sin(t)[:, None], (*rings.shape[:2], 1))], axis=2)
-    m, k = len(axis), np.arange(around)
-    a, b = (
-        (around * np.arange(m - 1)[:, None] + k).ravel(),
-        (around * np.arange(m - 1)[:, None] + (k + 1) % around).ravel(),
-    )
-    wall = np.concatenate([np.column_stack([a, a + around, b]), np.column_stack([b, a + around, b + around])])
-    ends = np.pad(axis[[0, -1]], ((0, 0), (0, 1)))
-    first, last = around * m, around * m + 1
-    inlet = np.column_stack([np.full(around, first), k, (k + 1) % around])
-    far = around * (m - 1)
-    outlet = np.column_stack([np.full(around, last), far + (k + 1) % around, far + k])
-    groups = np.repeat([0, 1, 2], [len(wall), around, around])
-    vertices, triangles = np.concatenate([points.reshape(-1, 3), ends]), np.concatenate([wall, inlet, outlet])
-    inward = np.einsum(
-        "ij,ij->i", vertices[triangles[:, 0]], np.cross(vertices[triangles[:, 1]], vertices[triangles[:, 2]])
-    )
-    if inward.sum() < 0:
-        triangles = triangles[:, ::-1]
-    return clvoro.Solid(vertices, triangles, groups=groups, group_names=["wall", "inlet", "outlet"])
+    """Return a pipe that turns by 90 degrees; patches are wall, inlet and outlet."""
+    angle = np.linspace(0, math.pi / 2, 40)
+    path = BEND * np.column_stack([np.sin(angle), 1 - np.cos(angle), 0 * angle])
+    steps = np.arange(17)[:, None] / 17
+    path = np.concatenate([(steps - 1) * (STRAIGHT, 0, 0), path, path[-1] + (1 - steps[::-1]) * (0, STRAIGHT, 0)])
+    part = creation.sweep_polygon(shapely.Point(0, 0).buffer(RADIUS, quad_segs=18), path)
+    x, y, _ = part.triangles_center.T
+    groups = np.select([x < -STRAIGHT + 1e-9, y > BEND + STRAIGHT - 1e-9], [1, 2], 0)
+    return clvoro.Solid(part.vertices, part.faces, groups=groups, group_names=["wall", "inlet", "outlet"])
 
 
 # Meshers: each writes the polyMesh of a case.
@@ -300,26 +277,6 @@ def measure(case: Case, adapter: clvoro.Adapter, flow: Flow, mesher: str, n: int
     return {**row, **figures_of(check_case(case.folder))}
 
 
-def draw(records: list[dict[str, Any]], folder: Path) -> None:
-    """Draw errors against cells."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    folder.mkdir(parents=True, exist_ok=True)
-    flows = list(dict.fromkeys(row["flow"] for row in records))
-    figure, axes = plt.subplots(len(flows), 2, figsize=(9, 4 * len(flows)), squeeze=False, layout="constrained")
-    for name, (left, right) in zip(flows, axes, strict=True):
-        for axis, key, title in ((left, "error", "velocity in all cells"), (right, "at wall", FLOWS[name].second)):
-            for mesher in MESHERS:
-                rows = [row for row in records if row["flow"] == name and row["mesher"] == mesher]
-                axis.loglog([r["cells"] for r in rows], [r[key] for r in rows], "o-", label=mesher)
-            axis.set(title=f"{name}: {title}", xlabel="cells", ylabel="error")
-            axis.legend(frameon=False)
-    figure.savefig(folder / "solid_flows.png", dpi=150)
-
-
 def main() -> None:
     """Run the bench."""
     options_of = parser(__doc__)
@@ -328,7 +285,6 @@ def main() -> None:
     options_of.add_argument("--meshers", default=",".join(MESHERS), metavar="NAMES")
     options_of.add_argument("--reference", type=int, default=60000, metavar="N", help="cells of the reference")
     options_of.add_argument("--keep", type=Path, metavar="FOLDER", help="keep the cases")
-    options_of.add_argument("--pictures", type=Path, metavar="FOLDER")
     options = options_of.parse_args()
     require("potentialFoam", "simpleFoam", "polyDualMesh", "gmshToFoam", "checkMesh")
     adapter, report = make_adapter(options), Report(options.json, COLUMNS)
@@ -345,8 +301,6 @@ def main() -> None:
                 row = measure(case, adapter, flow, mesher, n, reference)
                 if not (flow.has_reference and row["error"] == 0):
                     report.add({"flow": name, "mesher": mesher, **row}, f"{name}, {mesher}, {n}: {row['error']:.4f}")
-    if options.pictures is not None:
-        draw(report.records, options.pictures)
     report.finish(heading(adapter, "flows on meshes of solids"))
 
 
