@@ -38,22 +38,21 @@ def collapse_short_edges(mesh: Faces, parts: np.ndarray) -> Faces:
     parts : (k,) int
         Index of the named part of the boundary for each wall.
     """
-    failed, together = np.empty(0, np.int64), True
+    failed = np.empty(0, np.int64)
     for _ in range(_ROUNDS):
-        current = _Round(mesh, parts, failed, together)
+        current = _Round(mesh, parts, failed)
         if not current.faces.size:
             break
-        target, done = current.find_common_targets() if together else current.find_targets()
+        target, done = current.find_targets()
         if done.any():
             mesh, failed = current.collapsed(target, done), np.empty(0, np.int64)
-        elif not together:
+        else:
             failed = np.concatenate([failed, current.faces])
-        together = False
     return mesh
 
 
 class _Round:
-    """Short faces that share no cell, or only no point, and the points that move if they collapse.
+    """Short faces that share no cell, and the points that move if they collapse.
 
     Attributes
     ----------
@@ -76,8 +75,8 @@ class _Round:
         The point that takes its place: where two ends of a face merge, one of them.
     """
 
-    def __init__(self, mesh: Faces, parts: np.ndarray, failed: np.ndarray, together: bool) -> None:
-        """Choose among the short faces of `mesh` without those of `failed`; those chosen `together` may share cells."""
+    def __init__(self, mesh: Faces, parts: np.ndarray, failed: np.ndarray) -> None:
+        """Choose among the short faces of `mesh` without those of `failed`."""
         self.mesh, v = mesh, len(mesh.points)
         self.starts, self.loop, broken = simple_loops(mesh)
         self.cell = np.repeat(np.arange(mesh.n_cells), np.diff(self.starts))
@@ -91,8 +90,7 @@ class _Round:
         tried &= self.kind[ends].min(axis=1) == np.where(mesh.neighbor >= 0, _FREE, WALL)
         tried[failed] = False
         faces = np.flatnonzero(tried)
-        faces = faces[np.argsort(ratio[faces], kind="stable")]
-        self.faces = self._apart(faces) if together else self._independent(faces)
+        self.faces = self._independent(faces[np.argsort(ratio[faces], kind="stable")])
         self.a, self.b = ends[self.faces].T
         face_of = np.full(self.images.max(initial=-1) + 1, -1)  # of each class
         face_of[first[self.faces]] = face_of[second[self.faces]] = np.arange(len(self.faces))
@@ -113,12 +111,6 @@ class _Round:
         ranks = np.repeat(np.tile(np.arange(len(faces)), 2), np.diff(starts))
         return faces[independent(ranks, touched, np.arange(len(faces)), n)]
 
-    def _apart(self, faces: np.ndarray) -> np.ndarray:
-        """Return those of `faces`, the first ones preferred, that share no point with one another, nor its images."""
-        ends = self.images[self.mesh.corners.reshape(-1, 2)[faces]]
-        rows = np.repeat(np.arange(len(faces)), 2)
-        return faces[independent(rows, ends.ravel(), np.arange(len(faces)), self.images.max(initial=-1) + 1)]
-
     def _follow_images(self) -> tuple[np.ndarray, np.ndarray]:
         """Return `shift` and `into`."""
         points, v = self.mesh.points, len(self.mesh.points)
@@ -138,33 +130,22 @@ class _Round:
         """Return to which place both ends of each face can move, (e, 2), and whether they can, (e,) bool."""
         p, q = self.mesh.points[self.a], self.mesh.points[self.b]
         kind, other = self.kind[self.a], self.kind[self.b]
-        done, target, every = np.zeros(len(self.faces), bool), p.copy(), np.ones(len(self.faces), bool)
+        done, target = np.zeros(len(self.faces), bool), p.copy()
         for choice, allowed in (
             # The middle of two points on a wall may be off a curve.
             ((p + q) / 2, (kind == _FREE) & (other == _FREE)),
             (p, kind >= other),
             (q, kind <= other),
         ):
-            accepted = allowed & ~done & self._are_good(choice, every)
+            accepted = allowed & ~done & self._are_good(choice)
             target[accepted] = choice[accepted]
             done |= accepted
         return target, done
 
-    def find_common_targets(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the same for faces that may share cells, of which all that make one cell bad stay as they are."""
-        p, q = self.mesh.points[self.a], self.mesh.points[self.b]
-        kind, other = self.kind[self.a], self.kind[self.b]
-        target = np.where(((kind == _FREE) & (other == _FREE))[:, None], (p + q) / 2, q)
-        target[kind > other] = p[kind > other]
-        done = np.ones(len(self.faces), bool)
-        while (bad := done & ~self._are_good(target, done)).any():
-            done &= ~bad
-        return target, done
-
-    def _are_good(self, target: np.ndarray, done: np.ndarray) -> np.ndarray:
-        """Return for each face whether all cells around it remain convex if the faces `done` (e,) collapse, (e,)."""
+    def _are_good(self, target: np.ndarray) -> np.ndarray:
+        """Return for each face whether all cells around it remain convex if its ends go to `target` (e, 2), (e,)."""
         before, corners, row, least = self._around
-        face, into = self.face_of[corners], self._into(done)[corners]
+        every, face, into = np.ones(len(self.faces), bool), self.face_of[corners], self.into[corners]
         kept = into != into[following(before)]
         left = np.bincount(row, kept, len(least)).astype(int)
         after, into = np.concatenate([[0], np.cumsum(left)]), into[kept]
@@ -172,8 +153,8 @@ class _Round:
         key = np.sort(row[kept] * len(self.mesh.points) + into)
         bad = left < 3
         bad[key[1:][np.diff(key) == 0] // len(self.mesh.points)] = True
-        bad |= ~(_least_turns(self._moved(target, done)[into], after) >= np.minimum(least, STRAIGHT))
-        return np.bincount(face[face >= 0], bad[row[face >= 0]], len(done)) == 0
+        bad |= ~(_least_turns(self._moved(target, every)[into], after) >= np.minimum(least, STRAIGHT))
+        return np.bincount(face[face >= 0], bad[row[face >= 0]], len(every)) == 0
 
     @cached_property
     def _around(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -182,10 +163,6 @@ class _Round:
         starts, corners = take_rows(self.starts, self.loop, touched)
         row = np.repeat(np.arange(len(touched)), np.diff(starts))
         return starts, corners, row, _least_turns(self.mesh.points[corners], starts)
-
-    def _into(self, done: np.ndarray) -> np.ndarray:
-        """Return the point that takes the place of each, (v,), if the faces `done` (e,) collapse."""
-        return np.where((self.face_of >= 0) & done[self.face_of], self.into, np.arange(len(self.into)))
 
     def _moved(self, target: np.ndarray, done: np.ndarray) -> np.ndarray:
         """Return the points, (v, 2), where both ends of the faces `done` (e,) go to `target` (e, 2)."""
@@ -196,7 +173,8 @@ class _Round:
 
     def collapsed(self, target: np.ndarray, done: np.ndarray) -> Faces:
         """Return the mesh in which both ends of the faces `done` (e,) are at `target` (e, 2)."""
-        ends = self._into(done)[self.mesh.corners].reshape(-1, 2)
+        into = np.where((self.face_of >= 0) & done[self.face_of], self.into, np.arange(len(self.into)))
+        ends = into[self.mesh.corners].reshape(-1, 2)
         made = replace(self.mesh, points=self._moved(target, done), corners=ends.ravel())
         return made.take_faces(ends[:, 0] != ends[:, 1]).compact()
 
