@@ -19,6 +19,7 @@ from .shapes import coordinates
 from .surface_files import joined, read_parts
 from .triangles import crossing, packed_rows, packed_weights
 
+_ROUND_OFF = 1e-12  # of the extent: vertices that are nearer to each other are one
 _BLOCK = 1 << 14  # pairs of triangles per batch: they stay in the caches
 
 
@@ -43,9 +44,9 @@ class Surface:
 
     Notes
     -----
-    Corners at the same place count as one vertex, so a file of separate triangles (STL) serves as well as one with
-    shared vertices. Open, branching and self-intersecting surfaces are accepted, because distances to them are well
-    defined. `require_closed` and `check` refuse them.
+    Corners at the same place, up to round-off, count as one vertex, so a file of separate triangles (STL) serves as
+    well as one with shared vertices. Open, branching and self-intersecting surfaces are accepted, because distances to
+    them are well defined. `require_closed` and `check` refuse them.
 
     Examples
     --------
@@ -150,8 +151,9 @@ class Surface:
         """The places (p, 3), and that of each vertex, (v,) int."""
         unique, places = np.unique(self.vertices + 0.0, axis=0, return_inverse=True)
         places = places.reshape(-1)
-        if self.join > 0:
-            near = scipy.spatial.KDTree(unique).query_pairs(self.join, output_type="ndarray")
+        join = max(self.join, _ROUND_OFF * float(np.ptp(unique, axis=0).max()))
+        near = scipy.spatial.KDTree(unique).query_pairs(join, output_type="ndarray")
+        if len(near):
             shape = (len(unique), len(unique))
             graph = scipy.sparse.coo_array((np.ones(len(near)), (near[:, 0], near[:, 1])), shape=shape)
             joined = scipy.sparse.csgraph.connected_components(graph, directed=False)[1]

@@ -6,17 +6,19 @@ import math
 
 import numpy as np
 import scipy
+import shapely
 
 from ...arguments import format_point
 from ...errors import InputError
 from ..columns import Columns
 from ..surface import Surface
+from .combining import boolean, library, merged
 from .creases import connect, pair_sides, triangle_normals
 
+_FLAT = 1e-3  # of the extent of a hole: how far it may deviate from a plane
 _APART = 1e-6  # of the diagonal: how far from a triangle its two sides are examined
 _LARGEST_GAP = 1e-3  # of the diagonal: gaps that `join` may close
 _SHARPEST = 10.0  # degrees
-_CROSSINGS = 400_000  # triangles up to which self-intersections are sought
 
 
 def closing_distance(surface: Surface) -> float | None:
@@ -85,8 +87,11 @@ def require_bounding(surface: Surface, vertices: np.ndarray, triangles: np.ndarr
             f"{format_point(vertices[triangles[k, s]])}; expected all triangles counter-clockwise seen from outside; "
             "flip the others, or pass repair=True"
         )
-    corners = vertices[triangles]
-    inner, outer = sides_wound(vertices, triangles, twin)
+    try:
+        Surface(vertices, triangles, name).check()
+    except InputError as error:
+        raise InputError(f"{error}. Parts that cross or touch each other are united by repair=True") from None
+    inner, outer = _sides_wound(vertices, triangles, twin)
     wrong = np.flatnonzero((inner != 1) | (outer != 0))
     if not wrong.size:
         return twin
@@ -95,41 +100,31 @@ def require_bounding(surface: Surface, vertices: np.ndarray, triangles: np.ndarr
             f"{name} is inside out: all its triangles are clockwise seen from outside; flip them with "
             "triangles[:, ::-1], or pass repair=True. For the region around it use Solid.outside"
         )
-    where = format_point(corners[wrong[0]].mean(axis=0))
-    if ((inner == 2) | (outer == 1) | (inner == 1) & (outer == 0)).all():
-        raise InputError(
-            f"{name} has parts that overlap or lie in each other: {len(wrong)} triangles are inside of another part, "
-            f"the first at {where}; expected parts that do not overlap; unite them (a + b of two solids), or turn the "
-            "normals of cavities inwards (repair=True does that)"
-        )
     raise InputError(
-        f"{name} has {len(wrong)} triangles without the inside on one side and the outside on the other, the first at "
-        f"{where}; expected normals outwards, of cavities too, and no intersections; pass repair=True for the normals"
+        f"{name} has parts that lie in each other: {len(wrong)} triangles do not have the inside on one side and the "
+        f"outside on the other, the first at {format_point(vertices[triangles[wrong[0]]].mean(axis=0))}; expected "
+        "normals outwards, of cavities too; pass repair=True, which makes parts cavities, or leave parts out"
     )
 
 
-def sides_wound(vertices: np.ndarray, triangles: np.ndarray, twin: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _sides_wound(vertices: np.ndarray, triangles: np.ndarray, twin: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the winding numbers just inside and just outside of each triangle, (t,) int each.
 
-    Triangles thinner than the distance at which that is examined are left out: they count as 1 and 0.
+    They are the same on all of a part that crosses no other one: that of its largest triangle.
     """
     corners = vertices[triangles]
     normals, areas = triangle_normals(vertices, triangles, twin)
     apart = _APART * float(np.linalg.norm(np.ptp(corners.reshape(-1, 3), axis=0)))
-    longest = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2).max(axis=1)
-    sound = areas > 4 * apart * longest
+    shells = _shells(twin)
+    largest = np.array([shell[areas[shell].argmax()] for shell in shells])
+    middle = corners[largest].mean(axis=1)
     columns = Columns(corners)
-    inner, outer = np.ones(len(triangles), np.int64), np.zeros(len(triangles), np.int64)
-    middle = corners[sound].mean(axis=1)
-    inner[sound] = columns.winding(middle - apart * normals[sound])
-    outer[sound] = columns.winding(middle + apart * normals[sound])
-    return inner, outer
-
-
-def require_no_crossings(surface: Surface) -> None:
-    """Raise if triangles intersect; see `Surface.check`. Very large surfaces are not examined."""
-    if len(surface) <= _CROSSINGS:
-        surface.check()
+    sides = np.empty((2, len(triangles)), np.int64)
+    for side, away in zip(sides, (-apart, apart), strict=True):
+        wound = columns.winding(middle + away * normals[largest])
+        for shell, winding in zip(shells, wound, strict=True):
+            side[shell] = winding
+    return sides[0], sides[1]
 
 
 def sharp_edges(angle: np.ndarray) -> np.ndarray:
@@ -137,11 +132,12 @@ def sharp_edges(angle: np.ndarray) -> np.ndarray:
     return np.flatnonzero(np.minimum(angle, 2 * math.pi - angle) < math.radians(_SHARPEST))
 
 
-def repaired(surface: Surface, groups: np.ndarray) -> tuple[Surface, np.ndarray, list[str]]:
-    """Return a surface that is mended where that is certain, the groups, and what was done.
+def repaired(surface: Surface, groups: np.ndarray, n_groups: int) -> tuple[Surface, np.ndarray, tuple[str, ...], int]:
+    """Return a surface that is mended where that is certain, its groups, what was done, and the number of closed holes.
 
-    Vertices across small gaps are joined, triangles without three corners and duplicates are removed, neighbors are
-    oriented alike, and normals point out of the region, of cavities too.
+    Vertices across small gaps are joined, triangles without three corners and duplicates are removed, flat holes are
+    closed, each by a group of its own after those given, neighbors are oriented alike, parts that cross or touch each
+    other are united, and normals point out of the region, of cavities too.
     """
     done: list[str] = []
     if not surface.closed:
@@ -153,34 +149,159 @@ def repaired(surface: Surface, groups: np.ndarray) -> tuple[Surface, np.ndarray,
     whole = (triangles != np.roll(triangles, -1, axis=1)).all(axis=1)
     repeated = repeated_triangles(triangles[whole])
     rows = np.delete(np.flatnonzero(whole), repeated)
+    folds = _folds(triangles[rows], triangles[whole][repeated])
+    rows = np.delete(rows, folds)
     if repeated.size:
-        done.append(f"removed {len(repeated)} duplicate triangles")
+        done.append(f"removed {len(repeated) + len(folds)} duplicate triangles")
     triangles, groups = triangles[rows].copy(), groups[rows]
-    flipped = _flips(triangles)
-    triangles[flipped] = triangles[flipped, ::-1]
-    turned = flipped.copy()
-    twin, bad = pair_sides(vertices, triangles)
-    if not bad.size:
-        side = np.arange(len(twin))
-        count, shell = connect(len(triangles), np.column_stack([side, twin]) // 3)
-        for s in range(count):
-            mine = np.flatnonzero(shell == s)
-            others = np.flatnonzero(shell != s)
-            corners = vertices[triangles]
-            a, b, c = np.moveaxis(corners[mine] - corners[mine].mean(axis=(0, 1)), 1, 0)
-            volume = np.einsum("ij,ij->", a, np.cross(b, c))
-            spot = corners[mine[:1]].mean(axis=1)
-            # Odd depth: a cavity.
-            depth = sum(
-                abs(int(Columns(corners[others[shell[others] == o]]).winding(spot)[0]))
-                for o in np.unique(shell[others])
-            )
-            if (volume < 0) == (depth % 2 == 0):
-                triangles[mine] = triangles[mine, ::-1]
-                turned[mine] = ~turned[mine]
-    if turned.any():
-        done.append(f"flipped {np.count_nonzero(turned)} triangles")
-    return Surface(vertices, triangles, surface.name), groups, done
+    caps = _caps(Surface(vertices, triangles))
+    if caps:
+        done.append(f"closed {len(caps)} flat holes")
+        groups = np.concatenate([groups, np.repeat(n_groups + np.arange(len(caps)), list(map(len, caps)))])
+        triangles = np.concatenate([triangles, *caps])
+    turned = _flips(triangles)
+    triangles[turned] = triangles[turned, ::-1]
+    shells = _shells(pair_sides(vertices, triangles)[0])
+    turned ^= _turn_outwards(vertices, triangles, shells, nested=False)
+    met = _that_meet(Surface(vertices, triangles), shells)
+    if not met:
+        turned ^= _turn_outwards(vertices, triangles, shells, nested=True)
+    if turned[: len(rows)].any():
+        done.append(f"flipped {np.count_nonzero(turned[: len(rows)])} triangles")
+    if met:
+        done.append(f"united {len(met)} parts that cross or touch")
+        vertices, triangles, groups = _united(vertices, triangles, groups, met)
+        _turn_outwards(vertices, triangles, _shells(pair_sides(vertices, triangles)[0]), nested=True)
+    return Surface(vertices, triangles, surface.name), groups, tuple(done), len(caps)
+
+
+def _united(
+    vertices: np.ndarray, triangles: np.ndarray, groups: np.ndarray, shells: list[np.ndarray]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return vertices, triangles and groups of a surface of which `shells` are replaced by their union."""
+    names = [str(k) for k in range(int(groups.max()) + 1)]
+    one = boolean("+", *((vertices, triangles[shell], groups[shell], names) for shell in shells))
+    alone = np.setdiff1d(np.arange(len(triangles)), np.concatenate(shells))
+    united = (one["vertices"], one["triangles"], one["groups"], names)
+    one = merged([united, (vertices, triangles[alone], groups[alone], names)])
+    return *Surface(one["vertices"], one["triangles"]).welded, one["groups"]
+
+
+def _folds(triangles: np.ndarray, repeated: np.ndarray) -> np.ndarray:
+    """Return which triangles bound nothing, (k,) int: they were there twice, and have an edge with an odd number left.
+
+    They are sheets of zero thickness, and walls between parts that touch.
+    """
+    known = np.sort(np.vstack([repeated, triangles]), axis=1)
+    place = np.unique(known, axis=0, return_inverse=True)[1].reshape(-1)
+    twice = np.isin(place[len(repeated) :], place[: len(repeated)])
+    ends = np.stack([triangles, np.roll(triangles, -1, axis=1)], axis=2)
+    _, edge, count = np.unique(np.sort(ends.reshape(-1, 2), axis=1), axis=0, return_inverse=True, return_counts=True)
+    edge = edge.reshape(-1, 3)
+    folds = np.zeros(len(triangles), bool)
+    while (found := twice & ~folds & (count[edge] % 2 == 1).any(axis=1)).any():
+        count -= np.bincount(edge[found].reshape(-1), minlength=len(count))
+        folds |= found
+    return np.flatnonzero(folds)
+
+
+def _caps(surface: Surface) -> list[np.ndarray]:
+    """Return triangles that close the flat holes of a surface, (k, 3) int for each hole.
+
+    A ring of open edges inside of another one in its plane bounds the same hole: the end of a hollow pipe.
+    """
+    caps = []
+    rings = [ring for ring in _rings(surface.open_edges) if len(ring) > 2]
+    planes = [_plane(surface.vertices[ring]) for ring in rings]
+    left = [k for k, plane in enumerate(planes) if plane is not None]
+    while left:
+        center, axes, tolerance = planes[left[0]]
+        flat = {k: (surface.vertices[rings[k]] - center) @ axes.T for k in left}
+        shapes = {k: shapely.Polygon(x[:, :2]) for k, x in flat.items() if np.abs(x[:, 2]).max() <= tolerance}
+        shapes = {k: shape for k, shape in shapes.items() if shape.is_valid}
+        left = [k for k in left[1:] if k not in shapes]
+        around = {k: [o for o in shapes if o != k and shapes[o].contains(shapes[k])] for k in shapes}
+        for k in (k for k in shapes if len(around[k]) % 2 == 0):
+            inner = [o for o in shapes if k in around[o] and len(around[o]) == len(around[k]) + 1]
+            loops = [
+                _counterclockwise(rings[k], shapes[k]),
+                *(_counterclockwise(rings[o], shapes[o])[::-1] for o in inner),
+            ]
+            places = [(surface.vertices[loop] - center) @ axes[:2].T for loop in loops]
+            caps.append(np.concatenate(loops)[library().triangulate(places)].astype(np.int64))
+    return caps
+
+
+def _plane(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, float] | None:
+    """Return the center, the axes (3, 3) and the tolerance of the plane through points (n, 3), or None if none fits."""
+    center = points.mean(axis=0)
+    _, sizes, axes = np.linalg.svd(points - center, full_matrices=False)
+    tolerance = _FLAT * float(np.ptp(points, axis=0).max())
+    away = np.abs((points - center) @ axes[2]).max()
+    return (center, axes, tolerance) if away <= tolerance < sizes[1] else None
+
+
+def _counterclockwise(ring: np.ndarray, shape: shapely.Polygon) -> np.ndarray:
+    return ring if shape.exterior.is_ccw else ring[::-1]
+
+
+def _rings(edges: np.ndarray) -> list[np.ndarray]:
+    """Return the rings of edges (k, 2) int that share ends, as vertices in turn, without edges in no ring."""
+    at: dict[int, list[int]] = {}
+    for a, b in edges.tolist():
+        at.setdefault(a, []).append(b)
+        at.setdefault(b, []).append(a)
+    rings = []
+    for first in list(at):
+        while at[first]:
+            ring = [first]
+            while at[ring[-1]]:
+                end = at[ring[-1]].pop()
+                at[end].remove(ring[-1])
+                if end == first:
+                    rings.append(np.array(ring))
+                    break
+                ring.append(end)
+            else:
+                break
+    return rings
+
+
+def _shells(twin: np.ndarray) -> list[np.ndarray]:
+    """Return the triangles of each closed part, (k,) int each, from the partners of sides; nothing if one has none."""
+    if (twin < 0).any():
+        return []
+    count, shell = connect(len(twin) // 3, np.column_stack([np.arange(len(twin)), twin]) // 3)
+    return np.split(np.argsort(shell, kind="stable"), np.cumsum(np.bincount(shell, minlength=count))[:-1])
+
+
+def _turn_outwards(vertices: np.ndarray, triangles: np.ndarray, shells: list[np.ndarray], nested: bool) -> np.ndarray:
+    """Turn normals out of each shell, or into those that are cavities if shells are `nested`; return which."""
+    corners = vertices[triangles]
+    turned = np.zeros(len(triangles), bool)
+    spots = corners[[shell[0] for shell in shells]].mean(axis=1)
+    depth = np.zeros(len(shells), np.int64)
+    for s, shell in enumerate(shells if nested else ()):
+        wound = np.abs(Columns(corners[shell]).winding(spots))
+        wound[s] = 0
+        depth += wound
+    for shell, cavity in zip(shells, depth % 2 == 1, strict=True):
+        a, b, c = np.moveaxis(corners[shell] - corners[shell].mean(axis=(0, 1)), 1, 0)
+        if (np.einsum("ij,ij->", a, np.cross(b, c)) > 0) == cavity:
+            triangles[shell] = triangles[shell, ::-1]
+            turned[shell] = True
+    return turned
+
+
+def _that_meet(surface: Surface, shells: list[np.ndarray]) -> list[np.ndarray]:
+    """Return the shells that cross or touch another one."""
+    if len(shells) < 2:
+        return []
+    shell = np.empty(len(surface), np.int64)
+    for s, triangles in enumerate(shells):
+        shell[triangles] = s
+    pairs = shell[surface.crossings()]
+    return [shells[s] for s in np.unique(pairs[pairs[:, 0] != pairs[:, 1]])]
 
 
 def _flips(triangles: np.ndarray) -> np.ndarray:

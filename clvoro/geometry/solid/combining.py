@@ -52,11 +52,29 @@ def around(body: Solid, box: Solid) -> dict[str, Any]:
             f"Solid.outside got a body from {body.lower} to {body.upper} and a box from {box.lower} to {box.upper}, "
             "which do not overlap; do they have the same unit? Solid.read has units="
         )
-    return boolean(named_triangles(box), (vertices, triangles[outside], groups[outside], names), "-")
+    return boolean("-", named_triangles(box), (vertices, triangles[outside], groups[outside], names))
 
 
-def boolean(first: NamedTriangles, second: NamedTriangles, operation: str) -> dict[str, Any]:
-    """Return the arguments of the sum, difference or common part of two solids: `operation` is +, - or ^.
+def library() -> Any:
+    """Return the module manifold3d.
+
+    Raises
+    ------
+    MissingLibraryError
+        If it is not installed.
+    """
+    try:
+        import manifold3d
+    except ImportError as error:
+        raise MissingLibraryError(
+            "booleans of solids, repair of holes and overlaps, and bodies that touch or cross their box need "
+            "manifold3d; pip install 'clvoro[solids]' (or pip install manifold3d)"
+        ) from error
+    return manifold3d
+
+
+def boolean(operation: str, *parts: NamedTriangles) -> dict[str, Any]:
+    """Return the arguments of the sum (+) or common part (^) of solids, or of the first without the others (-).
 
     Raises
     ------
@@ -65,17 +83,11 @@ def boolean(first: NamedTriangles, second: NamedTriangles, operation: str) -> di
     InputError
         If nothing is left.
     """
-    try:
-        import manifold3d
-    except ImportError as error:
-        raise MissingLibraryError(
-            "booleans of solids, and bodies that touch or cross their box, need manifold3d; pip install "
-            "'clvoro[solids]' (or pip install manifold3d)"
-        ) from error
-    names = list(dict.fromkeys([*first[3], *second[3]]))
+    manifold3d = library()
+    names = list(dict.fromkeys(name for part in parts for name in part[3]))
     start = manifold3d.Manifold.reserve_ids(len(names))
     manifolds = []
-    for vertices, triangles, groups, own in (first, second):
+    for vertices, triangles, groups, own in parts:
         number = np.array([names.index(name) for name in own])[groups]
         order = np.argsort(number, kind="stable")
         used, begin = np.unique(number[order], return_index=True)
@@ -89,8 +101,8 @@ def boolean(first: NamedTriangles, second: NamedTriangles, operation: str) -> di
         if made.status() != manifold3d.Error.NoError:
             raise InputError(f"a boolean of solids got a surface that manifold3d refuses: {made.status().name}")
         manifolds.append(made)
-    a, b = manifolds
-    result = (a + b if operation == "+" else a - b if operation == "-" else a ^ b).to_mesh64()
+    kinds = {"+": manifold3d.OpType.Add, "-": manifold3d.OpType.Subtract, "^": manifold3d.OpType.Intersect}
+    result = manifold3d.Manifold.batch_boolean(manifolds, kinds[operation]).to_mesh64()
     if not len(result.tri_verts):
         raise InputError("a boolean of solids leaves nothing, expected a region; do the solids overlap?")
     lengths = np.diff(np.asarray(result.run_index).astype(np.int64)) // 3

@@ -29,7 +29,7 @@ from ..surface import Surface
 from ..surface_files import SOLIDS, FilePart, joined, parts_of, read_parts, word
 from ..triangles import packed_weights, pierced
 from ..wall_triangles import WallTriangles
-from .checks import repaired, require_bounding, require_no_crossings, sharp_edges
+from .checks import repaired, require_bounding, sharp_edges
 from .combining import around, boolean, named_triangles
 from .creases import CONCAVE, CONVEX, connect, corner_normals, dihedral_turns, find_creases, triangle_normals
 from .stations import Stations, place_stations
@@ -145,8 +145,9 @@ class Solid(Domain):
     name : str
         Name of the solid in error messages.
     repair : bool
-        Whether to join vertices across small gaps, remove duplicate triangles and orient the others, with a warning
-        that says what was done. Holes, overlaps and intersections stay errors.
+        Whether to join vertices across small gaps, remove duplicate triangles, close flat holes, orient triangles and
+        unite parts that cross or touch, with a warning that says what was done. Closed holes are boundaries with the
+        names ``hole-1``, ... Other holes, and parts that cross themselves, stay errors.
     creases : (e, 2) int, optional
         More edges at which patches end, as pairs of vertices.
 
@@ -165,6 +166,8 @@ class Solid(Domain):
     InputError, InputTypeError
         If the surface is not closed, intersects itself, or its normals do not point outwards; or a number or name is
         wrong.
+    MissingLibraryError
+        If a repair needs manifold3d, which is not installed.
 
     Warns
     -----
@@ -198,9 +201,12 @@ class Solid(Domain):
         group = _checked_groups(name, groups, len(given))
         self.repairs: tuple[str, ...] = ()
         given_area, given_volume = _areas(given.corners), _volume(given.corners)
+        known = ["wall"] if group_names is None and groups is None else list(group_names or ())
+        known += [f"group-{g}" for g in range(len(known), int(group.max()) + 1)]
+        self._group_names = tuple(known)
         if repair:
-            given, group, done = repaired(given, group)
-            self.repairs = tuple(done)
+            given, group, self.repairs, holes = repaired(given, group, len(known))
+            self._group_names += tuple(f"hole-{k + 1}" for k in range(holes))
         places, merged = given.welded
         self._places = given.places
         whole = (merged != np.roll(merged, -1, axis=1)).all(axis=1)
@@ -210,7 +216,6 @@ class Solid(Domain):
         if not (isinstance(angle, Real) and 0 < angle < 180):
             raise InputError(f"{name} angle is {angle!r}, expected degrees between 0 and 180")
         self.angle = float(angle)
-        self._group_names = ("wall",) if group_names is None and groups is None else tuple(group_names or ())
         vertices, triangles = self.surface.vertices, self.surface.triangles
         self.normals, self._areas = triangle_normals(vertices, triangles, self.twin)
         turns = dihedral_turns(vertices, triangles, self.twin, self.normals)
@@ -222,7 +227,6 @@ class Solid(Domain):
         self.lower, self.upper = tuple(lower.tolist()), tuple(upper.tolist())
         self.names = names
         self.names = self._checked_names()
-        require_no_crossings(self.surface)
         if self.repairs:
             before, after = float(np.nansum(given_area)), self.boundary_measure
             warn(
@@ -328,7 +332,7 @@ class Solid(Domain):
         """Return a boolean of two solids; names stay."""
         if not isinstance(other, Solid):
             return NotImplemented
-        return Solid(**boolean(named_triangles(self), named_triangles(other), operation), angle=self.angle)
+        return Solid(**boolean(operation, named_triangles(self), named_triangles(other)), angle=self.angle)
 
     @classmethod
     def box(cls, lower: Sequence[float], upper: Sequence[float], **options: Any) -> Solid:
@@ -601,8 +605,7 @@ class Solid(Domain):
         group = np.zeros(self.n_patches, np.int64)
         group[self.patch] = self._group
         used, index = np.unique(group, return_inverse=True)
-        known = self._group_names
-        names = tuple(known[g] if g < len(known) else f"group-{g}" for g in used.tolist())
+        names = tuple(self._group_names[g] for g in used.tolist())
         return BoundaryNames(names, index.reshape(-1).astype(np.int32), "patch")
 
     @property

@@ -131,7 +131,7 @@ FLIPPED = np.vstack([T[:3, ::-1], T[3:]])
         (V, FLIPPED, "oriented differently"),
         (V, T[:, ::-1], "inside out"),
         (np.vstack([V, V + 0.5]), np.vstack([T, T + 8]), "intersects itself"),
-        (np.vstack([V, 0.5 * V + 0.25]), np.vstack([T, T + 8]), "overlap or lie in each other"),
+        (np.vstack([V, 0.5 * V + 0.25]), np.vstack([T, T + 8]), "lie in each other"),
         (np.where((V == 1).all(axis=1)[:, None], -0.2, V), T, "triangles"),
     ],
 )
@@ -140,20 +140,45 @@ def test_surfaces_that_bound_no_region_are_refused_with_the_place(vertices, tria
         Solid(vertices, triangles)
 
 
+def sides(vertices, *axes):
+    """The triangles of a cube without the sides across the axes."""
+    flat = [np.ptp(vertices[T][:, :, axis], axis=1) == 0 for axis in axes]
+    return T[~np.any(flat, axis=0)]
+
+
+SMALL = 0.5 * V + 0.25
+TALL = SMALL * (1, 1, 2) - (0, 0, 0.5)
+FIN = np.vstack([V, (2, 0.5, 0.5)])
+
+
 @pytest.mark.parametrize(
-    ("vertices", "triangles", "says"),
+    ("vertices", "triangles", "says", "volume"),
     [
-        (*with_gap(1e-4), "joined vertices"),
-        (V, np.vstack([T, T[:1], T[3:4]]), "removed 2 duplicate"),
-        (V, FLIPPED, "flipped 3 triangles"),
-        (V, T[:, ::-1], "flipped 12 triangles"),
-        (np.vstack([V, 0.5 * V + 0.25]), np.vstack([T, T + 8]), "flipped 12 triangles"),
+        (*with_gap(1e-4), "joined vertices", 1),
+        (V, np.vstack([T, T[:1], T[3:4]]), "removed 2 duplicate", 1),
+        (FIN, np.vstack([T, [(0, 1, 8), (0, 8, 1)]]), "removed 2 duplicate", 1),
+        (V, FLIPPED, "flipped 3 triangles", 1),
+        (V, T[:, ::-1], "flipped 12 triangles", 1),
+        (np.vstack([V, SMALL]), np.vstack([T, T + 8]), "flipped 12 triangles", 0.875),
+        (V, sides(V, 2), "closed 2 flat holes", 1),
+        (np.vstack([V, TALL]), np.vstack([sides(V, 2), sides(TALL, 2) + 8]), "closed 2 flat holes", 0.75),
+        (np.vstack([V, V + 0.5]), np.vstack([T, T + 8]), "united 2 parts", 1.875),
+        (np.vstack([V, np.add(V, (1, 0, 0))]), np.vstack([T, T + 8]), "removed 4 duplicate", 2),
+        (np.vstack([V, np.add(V, (1, 0.5, 0)), V + 3]), np.vstack([T, T + 8, T + 16]), "united 2 parts", 3),
     ],
 )
-def test_repair_mends_what_is_certain_and_says_so(vertices, triangles, says):
+def test_repair_mends_what_is_certain_and_says_so(vertices, triangles, says, volume):
+    with pytest.raises(InputError):
+        Solid(vertices, triangles)
     with pytest.warns(MismatchWarning, match=says):
         solid = Solid(vertices, triangles, repair=True)
-    assert solid.measure == pytest.approx(1 if len(vertices) != 16 else 0.875, rel=1e-3)
+    assert solid.measure == pytest.approx(volume, rel=1e-3)
+    holes = [name for name in solid.boundary_names if name.startswith("hole")]
+    assert holes == (["hole-1", "hole-2"] if "holes" in says else [])
+
+
+def test_vertices_within_round_off_are_one():
+    assert Solid(*with_gap(1e-15)).measure == pytest.approx(1)
 
 
 def test_edges_sharper_than_ten_degrees_are_warned_of():
