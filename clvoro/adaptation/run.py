@@ -234,7 +234,7 @@ class Run:
         if count > peers.count:
             state = {name: getattr(self, name) for name in ("begun", "_renewed", "labeled", "_stop", "stop_reason")}
             peers.call(count, (mesh, progress_of(self), np.concatenate(self.rows), state))
-            vars(self._stages).pop("poisson", None)  # over another number of parts it has other kernels
+            self._stages.drop_poisson()
 
     def _join(self) -> bool:
         """Wait for work, and join a run that others have refined; return whether it goes on."""

@@ -39,3 +39,7 @@ class Stages(TessellationStages):
         """Free the buffers of `poisson`, if it exists; its kernels stay."""
         if "poisson" in vars(self):
             self.poisson.clear()
+
+    def drop_poisson(self) -> None:
+        """Free `poisson`, since over another number of parts it has other kernels."""
+        vars(self).pop("poisson", None)

@@ -49,7 +49,7 @@ class Peers:
     """The parts of a domain as one of them sees them. All of them call the same methods in the same order.
 
     This class stands for a domain in one part. Subclasses connect several parts: they replace `exchange`, `gather`,
-    `call` and `rest`.
+    `_call` and `_await_call`.
 
     While a mesh has few cells, only the first parts work (`lead`). The others are alone, and rest until part 0 calls
     them.
@@ -165,9 +165,21 @@ class Peers:
 
         The others among them return from `rest` with `message` of part 0.
         """
+        if self.number == 0:
+            self._call(range(self.count, count), (count, message))
+        self.lead(count)
 
     def rest(self) -> Any:
         """Wait for a `call` of this part, and return its message."""
+        count, message = self._await_call()
+        self.lead(count)
+        return message
+
+    def _call(self, parts: range, message: object) -> None:
+        """Send `message` to `parts` that rest."""
+
+    def _await_call(self) -> Any:
+        """Return the message of part 0 to this part, which rests."""
 
     def fail(self, error: BaseException) -> None:
         """Tell the others that this part has failed. Those that wait for a message raise a `RankError`."""
@@ -289,21 +301,15 @@ class Ranks(Peers):
             self._failed = self._alarms.recv(tag=ALARM)
             raise RankError(self._failed)
 
-    def call(self, count: int, message: object) -> None:
-        """Send `message`, and the number of ranks that now work, to the ranks that join."""
-        if self.number == 0:
-            more = range(self.count, count)
-            self._complete([self._alarms.isend((count, message), part, CALL) for part in more])
-        self.lead(count)
+    def _call(self, parts: range, message: object) -> None:
+        self._complete([self._alarms.isend(message, part, CALL) for part in parts])
 
-    def rest(self) -> Any:
+    def _await_call(self) -> Any:
         """Ask now and then whether rank 0 has sent something."""
         while not self._alarms.Iprobe(0, CALL):
             self._hear_alarm()
             time.sleep(REST)
-        count, message = self._alarms.recv(source=0, tag=CALL)
-        self.lead(count)
-        return message
+        return self._alarms.recv(source=0, tag=CALL)
 
     def fail(self, error: BaseException) -> None:
         """Send the text of `error` to all other ranks."""

@@ -120,18 +120,12 @@ class Threads(Peers):
         """Let all calls of other threads, and further ones of this thread, raise an error."""
         self._table.close(f"part {self.number} of {self.size} has failed: {type(error).__name__}: {error}")
 
-    def call(self, count: int, message: object) -> None:
-        """Give `message` to the threads that join."""
-        if self.number == 0:
-            for number in range(self.count, count):
-                self._table.call(number, (count, message))
-        self.lead(count)
+    def _call(self, parts: range, message: object) -> None:
+        for number in parts:
+            self._table.call(number, message)
 
-    def rest(self) -> Any:
-        """Wait for the call of thread 0."""
-        count, message = self._table.rest(self.number)
-        self.lead(count)
-        return message
+    def _await_call(self) -> Any:
+        return self._table.rest(self.number)
 
     def ask(self, call: Callable[[], object]) -> Any:
         """Return the result of `call` in the thread that waits for the team, or raise its error; None after Ctrl-C."""
