@@ -149,8 +149,9 @@ class _Rounds:
         self._by_team = by_team
         self._n, before = previous.n, len(previous.neighbors)
         n, most = previous.n, max(int(MAX_SHARE * previous.n), 1)
-        # Cells at walls of a solid are clipped anew, to other places.
-        self.room = int((1 + SPARE) * before + min(box.plane_count, n) * FACES_AT_WALL) + 64
+        # Cells at walls of a solid, and beside ghosts, are clipped anew, to other places.
+        anew = min(box.plane_count + (previous.rows - n) // 2, n)
+        self.room = int((1 + SPARE) * before + anew * FACES_AT_WALL) + 64
         self.cut = cells.take_cells(n, self.room)
         self._changed, self._marks, self._listed = (engine.scratch(n, np.int32) for _ in range(3))
         self._more = engine.scratch(n * MORE, np.int32)
