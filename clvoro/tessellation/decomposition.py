@@ -23,26 +23,31 @@ def hilbert_keys(points: np.ndarray, lower: np.ndarray, upper: np.ndarray, bits:
 
     The transformation is that of Skilling (2004), AIP Conf. Proc. 707, 381.
     """
-    d, one = points.shape[1], np.uint64(1)
+    d, one = points.shape[1], np.uint32(1)
     with np.errstate(divide="ignore", invalid="ignore"):
         unit = np.nan_to_num((points - lower) / (upper - lower))
-    x = list(np.clip(unit * 2.0**bits, 0, 2.0**bits - 1).astype(np.uint64).T)
-    for bit in range(bits - 1, 0, -1):
-        q, p = one << np.uint64(bit), (one << np.uint64(bit)) - one
+    x = list(np.clip(unit * 2.0**bits, 0, 2.0**bits - 1).T.astype(np.uint32, order="C"))
+    for bit in map(np.uint32, range(bits - 1, 0, -1)):
+        p = (one << bit) - one
         for a in range(d):
-            flips = (x[a] & q) != 0
-            t = np.where(flips, 0, (x[0] ^ x[a]) & p)
-            x[0] = np.where(flips, x[0] ^ p, x[0] ^ t)
-            x[a] = x[a] ^ t if a else x[a]
+            flips = -(x[a] >> bit & one) & p
+            t = (x[0] ^ x[a]) & (flips ^ p)
+            x[0] ^= flips | t
+            if a:
+                x[a] ^= t
     for a in range(1, d):
-        x[a] = x[a] ^ x[a - 1]
-    t = np.zeros(len(points), np.uint64)
-    for bit in range(bits - 1, 0, -1):
-        t = np.where(x[-1] & (one << np.uint64(bit)), t ^ ((one << np.uint64(bit)) - one), t)
+        x[a] ^= x[a - 1]
+    t = np.zeros(len(points), np.uint32)
+    for bit in map(np.uint32, range(bits - 1, 0, -1)):
+        t ^= -(x[-1] >> bit & one) & ((one << bit) - one)
+    half = (bits + 1) // 2
+    numbers, low = np.arange(2**half, dtype=np.uint64), np.uint32(2**half - 1)
+    spread = sum((numbers >> np.uint64(b) & np.uint64(1)) << np.uint64(d * b) for b in range(half))
     keys = np.zeros(len(points), np.uint64)
-    for bit in range(bits - 1, -1, -1):
-        for a in range(d):
-            keys = keys << one | (x[a] ^ t) >> np.uint64(bit) & one
+    for a in range(d):
+        x[a] ^= t
+        wide = spread[x[a] & low] | spread[x[a] >> np.uint32(half)] << np.uint64(d * half)
+        keys |= wide << np.uint64(d - 1 - a)
     return keys
 
 

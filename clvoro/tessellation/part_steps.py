@@ -39,7 +39,7 @@ from .polyhedra import Polyhedra
 from .stages import TessellationStages
 from .steps import DomainSteps, Sort
 
-FIRST_REACH = {(3, 3): 1.9, (2, 2): 3.3, (3, 2): 2.4}
+FIRST_REACH = {(3, 3): 2.5, (2, 2): 3.3, (3, 2): 3.0}
 """Radius of the first balls over the spacing of the generators around, by the dimensions of space and cells. Where
 cells have two, those of neighboring ghosts must be final, too. On a sphere the spacing is overestimated: bins are cubes
 in space."""
@@ -47,13 +47,15 @@ BOUNDARY_REACH = 2.4
 """The same for cells that a boundary cuts, in all parts."""
 LAST_LABEL = 2**31 - 1
 """Label of the first ghost generator outside of a polygon; the others have those before it."""
-RUN = 32
-"""Number of successive generators from which their spacing is estimated."""
-JUMP = 8
+RUN, AHEAD = 32, 4
+"""Number of successive generators from which their spacing is estimated, and of the next ones that are compared."""
+JUMP = 12
 """Number of spacings between successive generators beyond which a new chunk begins."""
-GROWTH, SKIN = 1.4, 0.15
+GROWTH, SKIN, SHARE = 1.4, 0.25, 0.4
 """`GROWTH`: radius of the balls of a part, divided by the radius that its cells need. `SKIN`: width of the skin around
-each ball, as a share of the ball's radius. A part also asks for generators in the skin: they may move into the ball."""
+each ball, as a share of the ball's radius. A part also asks for generators in the skin: they may move into the ball.
+`SHARE`: of the room between the ball that a cell needs and the nearest generator that is not known, what the ball gets;
+the rest is skin."""
 NEAR, FREE = 1.2, 0.8
 """Largest distance between a ball and a box of another part that are compared, over the largest radius of the balls of
 both. Radius around a generator within which all others are known, over its distance from other parts."""
@@ -64,7 +66,7 @@ NOISE = {"float64": 1e-6, "float32": 1e-4}
 FILLED, MATCHED = {"float64": 1e-8, "float32": 1e-3}, {"float64": 1e-5, "float32": 1e-3}
 """`FILLED`: largest relative difference between the volume of all cells and that of the domain. `MATCHED`: largest
 relative difference between the measures of faces between parts, seen from both sides."""
-MOST_GHOSTS = 0.5
+MOST_GHOSTS = 1.0
 """In 3D cells are built anew, and not updated, if there are more ghosts than this share of the own generators: too many
 cells are beside ghosts."""
 GROUP = 64
@@ -80,6 +82,15 @@ def _curve(dim: int) -> np.ndarray:
     side = 2 ** (16 // dim)
     cells = np.indices((side,) * dim).reshape(dim, -1).T
     return hilbert_keys(cells, np.zeros(dim), np.full(dim, side), 16 // dim).astype(np.uint16)
+
+
+def _nearest_ahead(points: np.ndarray) -> np.ndarray:
+    """Return the square of the distance of each of `points` (n, d) from the nearest of the next `AHEAD`, (n,)."""
+    nearest = np.full(len(points), np.inf)
+    for ahead in range(1, min(AHEAD, len(points) - 1) + 1):
+        way = points[ahead:] - points[:-ahead]
+        np.minimum(nearest[:-ahead], np.einsum("ij,ij->i", way, way), out=nearest[:-ahead])
+    return nearest
 
 
 class Chunks:
@@ -101,26 +112,29 @@ class Chunks:
     groups : (n,) int
         The chunk of each generator.
     spacings : (n,) float
-        An estimate of the spacing around each generator. A run of `RUN` generators has the median distance between
-        successive ones; the estimate is the largest of three runs, that of the generator and the two beside it.
+        An estimate of the spacing around each generator. A run of `RUN` generators has the median of their distances
+        from the nearest of the next `AHEAD`, in the order of chunks or of bins; the estimate is the largest of three
+        runs, that of the generator and the two beside it.
     """
 
     def __init__(self, points: np.ndarray, least: float) -> None:
         n, dim = points.shape
-        ways = np.linalg.norm(np.diff(points, axis=0), axis=1)
-        runs = np.arange(max(n // RUN, 1)) * RUN
-        usual = np.full(len(runs), least)
-        if n >= 2 * RUN:
-            usual = np.maximum(usual, np.median(ways[runs[:, None] + np.arange(RUN - 1)], axis=1))
-        usual = np.maximum(usual, np.maximum(np.append(usual[1:], usual[-1]), np.append(usual[0], usual[:-1])))
-        self.spacings = np.repeat(usual, np.diff(np.append(runs, n)))
         side, lower, upper = 2 ** (16 // dim), points.min(axis=0), points.max(axis=0)
         cells = ((points - lower) * (side / np.maximum(upper - lower, least))).astype(np.int32)
         cells = np.minimum(cells, side - 1) @ side ** np.arange(dim)[::-1]
         self.order = np.argsort(_curve(dim)[cells], kind="stable")
+        x = points[self.order]
+        nearest = np.minimum(_nearest_ahead(x), _nearest_ahead(points)[self.order])
+        runs = np.arange(max(n // RUN, 1)) * RUN
+        usual = np.full(len(runs), least)
+        if n >= 2 * RUN:
+            usual = np.maximum(usual, np.sqrt(np.median(nearest[: len(runs) * RUN].reshape(-1, RUN), axis=1)))
+        usual = np.maximum(usual, np.maximum(np.append(usual[1:], usual[-1]), np.append(usual[0], usual[:-1])))
+        usual = np.repeat(usual, np.diff(np.append(runs, n)))
+        self.spacings = np.empty(n)
+        self.spacings[self.order] = usual
         # Generators may have moved far from the others of their part.
-        ways = np.linalg.norm(np.diff(points[self.order], axis=0), axis=1)
-        jumps = 1 + np.flatnonzero(ways > JUMP * self.spacings[self.order[:-1]])
+        jumps = 1 + np.flatnonzero(np.linalg.norm(np.diff(x, axis=0), axis=1) > JUMP * usual[:-1])
         count = math.isqrt(n)
         self.firsts = np.unique(np.concatenate([np.arange(count) * n // count, jumps]))
         self.groups = np.empty(n, np.int32)
@@ -252,14 +266,23 @@ class Answers:
         """Number of generators that this part needs."""
         return int(sum(rows[:, 1].sum() for rows in self.new))
 
-    def shrink(self) -> None:
-        """Make the balls smaller, so that no given generator is in a skin: these generators do not become ghosts."""
+    def settle(self, needed: np.ndarray) -> np.ndarray:
+        """Make the balls smaller, so that no given generator is in a skin: these generators do not become ghosts.
+
+        Each ball becomes larger than `needed` (n,) by a share of the way to the nearest generator that this part does
+        not know. Return the largest radius and the smallest skin of each group, (k, 2).
+        """
         places, balls = np.concatenate([rows[:, 2:-1] for rows in self.new]), self.balls
+        known = (1 + SKIN) * balls.radii
         if len(places) and len(self.asked):
-            tree = scipy.spatial.cKDTree(places)
-            radii = balls.radii[self.asked]
-            near, _ = tree.query(balls.centers[self.asked], distance_upper_bound=(1 + SKIN) * radii.max())
-            balls.radii[self.asked] = np.minimum(radii, near - SKIN * radii)
+            near, _ = scipy.spatial.cKDTree(places).query(
+                balls.centers[self.asked], distance_upper_bound=known[self.asked].max()
+            )
+            known[self.asked] = np.minimum(known[self.asked], near)
+        balls.radii = needed + SHARE * (known - needed)
+        rows, firsts = balls.chunks.order, balls.chunks.firsts
+        skins = np.minimum.reduceat((known - balls.radii)[rows], firsts)
+        return np.column_stack([np.maximum.reduceat(balls.radii[rows], firsts), skins])
 
 
 def gaps(boxes: np.ndarray, others: np.ndarray) -> np.ndarray:
@@ -332,6 +355,7 @@ class PartSteps(DomainSteps):
         self._measure = domain.measure / domain.frame[1] ** domain.cell_dim
         self._room = NamedArrays(stages.engine, spare=1 / 16)
         self._labels: cla.Array | None = None
+        self._answers: Answers | None = None
 
     @property
     def is_periodic(self) -> bool:
@@ -404,10 +428,7 @@ class PartSteps(DomainSteps):
         self._sides, self._rows = np.empty(0, int), np.empty(0, np.int32)
         self._caps = FIRST_REACH[self.domain.dim, self.domain.cell_dim] * self._chunks.spacings
         x = np.concatenate([x, self._share_landmarks(x)])
-        answers = self._ask(x, self._caps, self._caps)
-        self._take(answers)
-        self._limit(answers)
-        self._store()
+        self._take(self._ask(x, self._caps, self._caps))
 
     def _share_landmarks(self, x: np.ndarray) -> np.ndarray:
         """Give the generators nearest to the landmarks to all parts; own ones are at `x` (n, d).
@@ -447,6 +468,9 @@ class PartSteps(DomainSteps):
         order = np.argsort(self._sides, kind="stable")
         self._sides, self._rows = self._sides[order], self._rows[order]
         self._caps[n:], self._limits[n:] = self._caps[n:][order], self._limits[n:][order]
+        places = np.concatenate([np.arange(n), n + np.argsort(order)])
+        assert self._answers is not None
+        self._answers = replace(self._answers, rows=places[self._answers.rows])
         parts, way = np.divmod(self._sides, ways)
         # This part is on the opposite side of the other part.
         sent = [np.concatenate(self._sent[k : k + ways][::-1]) for k in range(0, len(self._sent), ways)]
@@ -527,8 +551,11 @@ class PartSteps(DomainSteps):
             sums = self.peers.total(sums)
             if sums[5] or cells is None:
                 return None
-            if sums[3] and not self._ask_again(part, needed.get().astype(float)):
-                return None
+            if sums[3]:
+                if not self._ask_again(part, needed.get().astype(float)):
+                    return None
+            elif self._answers is not None:
+                self._settle(self._answers, part, needed.get().astype(float))
             if not sums[6]:
                 break
             # All parts trace the boundary at the same place.
@@ -590,14 +617,20 @@ class PartSteps(DomainSteps):
             new, short = self.peers.total(np.array([answers.needed, (needed > radii).any()]))
             if new:
                 self._take(answers)
-                self._limit(answers)
-                self._store()
                 return False
-            answers.shrink()
-            self._limit(answers)
             if not short:
-                self._note(part.points)
+                self._settle(answers, part, needed)
                 return True
+
+    def _settle(self, answers: Answers, part: Part, needed: np.ndarray) -> None:
+        """Divide the room around the balls that cells of `part` need, and set the limits of own generators."""
+        needed = np.append(needed, np.zeros(len(self._caps) - len(needed)))
+        told, self._answers = self.peers.exchange([answers.settle(needed[answers.rows])] * self.peers.count), None
+        for side, facing in answers.facing.items():
+            facing.facts[:, -2:] = told[side // len(self._shifts)]
+        self._limits[:] = 0
+        self._limits[answers.rows] = np.column_stack(self._limits_of(answers.balls, answers.facing))
+        self._note(part.points)
 
     def _ask(self, x: np.ndarray, radii: np.ndarray, needed: np.ndarray) -> Answers:
         """Ask for the generators in balls around own generators, and around some ghosts.
@@ -648,11 +681,11 @@ class PartSteps(DomainSteps):
         rows = np.concatenate([rows[:, 0] for rows in answers.new]).astype(np.int32)
         self._sides, self._rows = np.concatenate([self._sides, *sides]), np.concatenate([self._rows, rows])
         self._caps = np.append(self._caps, np.zeros(len(rows)))
-
-    def _limit(self, answers: Answers) -> None:
-        """Set the limits of own generators, and of ghosts that have balls."""
+        # All in the balls and their skins are known, while no generator moves.
+        self._answers = replace(answers, new=[rows[:0] for rows in answers.new])
         self._limits, self._at = np.zeros((len(self._caps), 2)), None
-        self._limits[answers.rows] = np.column_stack(self._limits_of(answers.balls, answers.facing))
+        self._limits[answers.rows, 0] = (1 + SKIN) * answers.balls.radii
+        self._store()
 
     def _unknown(self, own: BallGroups, balls: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the own generators in `balls` (m, d + 2) that are not among the `known` ones, and their positions.
