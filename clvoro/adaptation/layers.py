@@ -138,8 +138,8 @@ def lay_out(
         least = len(rows) + max(free.n_pieces, n_fixed)
         if n_cells is not None and n_cells < least:
             raise InputError(
-                f"n_cells is {n_cells}, but layers have {len(rows)} cells, expected at least {least}; leave "
-                "n_cells out, or make the cells of the layers wider"
+                f"n_cells is {n_cells}, but layers have {len(rows)} cells, expected at least {least}; give "
+                "more, or make the cells of the layers wider"
             )
         limited = _beside_rows(field, made)
     if domain.borders is not None:

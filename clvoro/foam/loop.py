@@ -122,6 +122,10 @@ class FieldSizes:
             if not self.adjoints:
                 raise InputError(f"viscosity is {self.viscosity!r} without adjoints, expected both; name adjoints=")
 
+    def of_case(self, case: FoamCase) -> FieldSizes:
+        """Return these with what a case knows: its viscosity, if adjoints need one."""
+        return replace(self, viscosity=case.viscosity()) if self.adjoints and self.viscosity is None else self
+
     def __call__(self, found: Mapping[str, np.ndarray], on: Diagram, n_cells: int) -> Estimate:
         """Return the estimate from values in cells, (n,) or (n, d), by the names of the fields."""
         missing = [name for name in (*self.fields, *self.adjoints) if name not in found]
@@ -238,12 +242,11 @@ def adapt_case(
     if solver is None and cycles > 1:
         raise InputError(f"cycles is {cycles} without a solver, expected 1; give solver=, such as 'simpleFoam'")
     known, sizes = FoamCase(case), sizes or FieldSizes()
-    if isinstance(sizes, FieldSizes) and sizes.adjoints and sizes.viscosity is None:
-        sizes = replace(sizes, viscosity=known.viscosity())
+    complete = getattr(sizes, "of_case", None)
     loop = _Loop(
         known,
         n_cells,
-        sizes,
+        complete(known) if complete else sizes,
         check_number("window", window, least=0),
         None if layers is None else (layers,) if isinstance(layers, Layers) else tuple(layers),
         effort,

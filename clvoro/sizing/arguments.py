@@ -53,7 +53,7 @@ def check_slope(what: str, growth: object, slope: object) -> float:
         if not 1 <= rate <= _MAX_GROWTH:
             raise InputError(
                 f"{what} growth is {growth}, expected 1 to {_MAX_GROWTH}: the ratio of the sizes of neighboring "
-                "cells, such as 1.2; write slope= for dh/dx"
+                "cells, such as 1.2"
             )
         return math.log(rate)
     if not (isinstance(slope, Real) and 0 <= float(slope) < math.inf):

@@ -110,9 +110,14 @@ class OnCells(Field):
         domain = self.mesh.domain
         self.dim, self.on_sphere = domain.dim, domain.cell_dim < domain.dim
 
+    @property
+    def _places(self) -> np.ndarray:
+        """Where the values hold, (n, d)."""
+        return self.mesh.centroids
+
     @cached_property
     def _cells(self) -> tuple[np.ndarray, np.ndarray]:
-        """Centroids (k, d), with the images that a periodic box needs, and values, bounds and slopes, (k, 3 + d)."""
+        """Places (k, d), with the images that a periodic box needs, and values, bounds and slopes, (k, 3 + d)."""
         v = self.values
         low, high = self._stencils.bounds(v)
         # A cell at a wall ends beyond its centroid: values rise, or fall, as much towards the wall as away from it.
@@ -120,7 +125,7 @@ class OnCells(Field):
         least, most = np.maximum(2 * v - high, v.min()), np.minimum(2 * v - low, v.max())
         low, high = np.where(wall, np.minimum(low, least), low), np.where(wall, np.maximum(high, most), high)
         slopes = derivatives(v, self.mesh)[0]
-        points, rows = self.mesh.centroids, np.arange(len(v))
+        points, rows = self._places, np.arange(len(v))
         domain = self.mesh.domain
         if any(domain.periodic):
             reach = 1.5 * self._stencils.lengths.max(initial=0.0)
@@ -165,10 +170,10 @@ class OnCells(Field):
         return writer.variable(f"size_on_cells(x, data + {at}, {len(x)}, {tree.levels})")
 
     def landmarks(self, domain: Domain) -> np.ndarray:
-        """Return the centroids of the smallest values in groups of cells, at most 4096."""
-        order = _Tree.of(self.mesh.centroids).order
+        """Return the places of the smallest values in groups of cells, at most 4096."""
+        order = _Tree.of(self._places).order
         groups = np.array_split(order, min(len(order), _LANDMARKS))
-        return self.mesh.centroids[[group[self.values[group].argmin()] for group in groups]]
+        return self._places[[group[self.values[group].argmin()] for group in groups]]
 
     def warnings(self, domain: Domain) -> list[str]:
         """Return a warning if the mesh covers little of `domain`."""

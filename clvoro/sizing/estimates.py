@@ -29,6 +29,9 @@ SMOOTHED = 2
 class Estimate(OnCells):
     """Sizes on the cells of a mesh, a size field, with the error that they lead to.
 
+    The field has these sizes at the generators, not at the centroids. In a graded mesh a generator is on the finer side
+    of its cell, and the size at the generator becomes that of the cell.
+
     Attributes
     ----------
     mesh : Diagram
@@ -47,6 +50,11 @@ class Estimate(OnCells):
         super().__init__(mesh, values)
         self.error = check_cell_values("Estimate error", error, len(self.values))
         self.order, self.p = order, p
+
+    @property
+    def _places(self) -> np.ndarray:
+        """The generators: a run evaluates sizes there."""
+        return self.mesh.points
 
     @property
     def norm(self) -> float:
@@ -223,13 +231,18 @@ def estimate(
     """Return the sizes for which the error constant * indicator * h^order is least in L^p, with that error.
 
     The sizes are those of `best_sizes`, which also takes the `bounds`: `n_cells`, `eps`, `h_min` and `h_max`. They are
-    smoothed in `smoothed` passes after their growth is limited, so that a peak of the indicator stays narrow.
+    smoothed in `smoothed` passes after their growth is limited, so that a peak of the indicator stays narrow. What is
+    promised holds afterwards: growth is limited again, and sizes are scaled where the error exceeds `eps`.
     """
     slope = check_slope(what, growth, None)
     stencils = CellStencils.of(on)
     places = _places(stencils, slope, smoothed)
     sizes = best_sizes(what, indicator, places, order=order, p=p, constant=constant, **bounds)
-    return Estimate(stencils.mesh, sizes, constant * indicator * sizes**order, order, p)
+    made = Estimate(stencils.mesh, sizes, constant * indicator * sizes**order, order, p)
+    eps = bounds["eps"]
+    if eps is None or made.norm <= eps * (1 + 1e-9):
+        return made
+    return made.with_sizes(np.maximum(sizes * (eps / made.norm) ** (1 / order), bounds["h_min"]))
 
 
 def _places(stencils: CellStencils, slope: float, smoothed: int = 0) -> Places:
@@ -237,7 +250,7 @@ def _places(stencils: CellStencils, slope: float, smoothed: int = 0) -> Places:
 
     def limit(sizes: np.ndarray) -> np.ndarray:
         limited = stencils.limit_growth(sizes, slope)
-        return np.exp(stencils.smooth(np.log(limited), smoothed)) if smoothed else limited
+        return stencils.limit_growth(stencils.smooth(limited, smoothed), slope) if smoothed else limited
 
     longest = min(float(domain.extent.max()), domain.largest_size)
     return Places(stencils.mesh.volumes, domain.cell_dim, longest, limit)
@@ -320,7 +333,7 @@ def combine(*estimates: Estimate, by: Literal["max", "mean"] = "max") -> Estimat
     if by not in ("max", "mean"):
         raise InputError(f"combine got by={by!r}, expected 'max' or 'mean'")
     last = estimates[-1]
-    d, x = last.mesh.domain.cell_dim, last.mesh.centroids
+    d, x = last.mesh.domain.cell_dim, last._places
     sizes = [e.values if e.mesh is last.mesh else e(x) for e in estimates]
     errors = [e.error if e.mesh is last.mesh else OnCells(e.mesh, e.error)(x) for e in estimates]
     h = np.minimum.reduce(sizes) if by == "max" else np.mean([s**-d for s in sizes], axis=0) ** (-1 / d)

@@ -109,9 +109,8 @@ def hessian_size(
     at, missing
         As for `Raster`, of rasters only.
     growth : float
-        On a mesh only: ratio of the sizes of neighboring cells at most. Then `hessian_size` smooths the sizes over two
-        rings of neighbors: they may grow a little faster, and their error, `Estimate.norm`, may exceed `eps`. `n_cells`
-        holds at the end. Around a raster write `Graded`.
+        On a mesh only: ratio of the sizes of neighboring cells at most. `hessian_size` also smooths the sizes over two
+        rings of neighbors. Around a raster write `Graded`.
     weight : (n,) array of float, optional
         On a mesh only: factor of the curvature in each cell. For a goal such as drag it is the `steepness` of the
         adjoint velocity, with p = 1 (Loseille, Dervieux and Alauzet 2010, J. Comput. Phys. 229, 2866); `force_weight`
