@@ -1,15 +1,12 @@
 """How long the first run takes: separate processes with empty kernel caches.
 
-    python bench/first_run.py [--repeat N] [--warm] [--programs] [--small] [--json]
+    python bench/first_run.py [--repeat N] [--warm] [--json]
     python bench/first_run.py --record
 
 A box in 2D (625 cells) and one in 3D (1000 cells) are adapted with default options, and 1000 generators get cells of
-prescribed volumes (`transport`). Printed are the machine, the number
-of programs and kernels that are built, and the medians of the seconds that a process takes to import the package, to
-make an adapter, and to run. The processor time includes that of workers, and is disturbed less by others on the
-machine. `--warm` repeats the runs with full caches. `--programs` prints the seconds of processor time per program.
-`--small` prints only what later runs of small meshes in one process take: the least seconds, of processor time, and of
-the main thread.
+prescribed volumes (`transport`). A row has the programs and kernels that are built, and the medians of the seconds that
+a process takes to import the package, to make an adapter, and to run. The processor time includes that of workers, and
+is disturbed less by others on the machine. `--warm` repeats the runs with full caches.
 `--record` writes `clvoro/opencl/first_kernels.json`: which kernels a first run needs, in which order.
 """
 
@@ -23,6 +20,10 @@ import subprocess
 import sys
 import tempfile
 from pathlib import Path
+
+from _common import Report, heading, shown
+
+import clvoro
 
 RUNS = {
     "2D box": ("clvoro.Box((0, 0), (1, 1))", 0.04),
@@ -49,22 +50,6 @@ RECORDED = {
 }
 """Domain, job if it is not a run, and what an adapter does."""
 KINDS = {name: RECORDED[name] for name in ("2D box", "3D box", "2D box, transport", "3D box, transport")}
-SMALL = {
-    "2D box, 800 cells": ("clvoro.Box((0, 0), (1, 1))", 0.03536),
-    "2D polygon, 600 cells": ("clvoro.Polygon([(0, 0), (1, 0), (1, 1), (0.4, 1), (0.4, 0.5), (0, 0.5)])", 0.03651),
-    "3D box, 600 cells": ("clvoro.Box((0, 0, 0), (1, 1, 1))", 0.1186),
-}
-AGAIN = """
-import json, time
-import clvoro
-clocks = time.perf_counter, time.process_time, time.thread_time
-domain, spent = {domain}, []
-for _ in range(8):
-    began = [clock() for clock in clocks]
-    clvoro.adapt(domain, {size})
-    spent.append([clock() - start for clock, start in zip(clocks, began)])
-print(json.dumps([min(times) for times in zip(*spent)]))
-"""
 RUN = """
 import json, resource, time
 {given}
@@ -84,39 +69,6 @@ marks[-1] = marks[-1][0], clocks()[1]
 names = "import", "adapter", "run"
 spent = {{n: [b[i] - a[i] for i in (0, 1)] for n, a, b in zip(names, marks, marks[1:])}}
 print(json.dumps(spent))
-"""
-PROGRAMS = """
-import json, resource
-import numpy as np, pyopencl as cl
-import clvoro
-from clvoro.opencl import prebuild, program
-def clock():
-    own, ended = (resource.getrusage(w) for w in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
-    return own.ru_utime + own.ru_stime + ended.ru_utime + ended.ru_stime
-ctx = clvoro.create_context()
-engine = clvoro.Adapter(ctx)._stages_for({domain}).engine
-recorded = prebuild._record()[prebuild.kind_of(engine, "{job}")]
-work = prebuild._work(engine, recorded)
-zeros = cl.Buffer(ctx, cl.mem_flags.COPY_HOST_PTR, hostbuf=np.zeros(1 << 20, np.uint8))
-rows, began = [], clock()
-for index, (stage, _) in enumerate(recorded["programs"]):
-    built, kernels, ready = program.compile_text(ctx, *work.programs[index]), 0, clock()
-    for launch in work.launches:
-        if launch.program == index:
-            kernel, kernels = cl.Kernel(built, launch.kernel), kernels + 1
-            kernel.set_args(*(np.zeros(size, np.uint8) if size else zeros for size in launch.sizes))
-            cl.enqueue_nd_range_kernel(engine.queue, kernel, (launch.group,), (launch.group,)).wait()
-    rows.append([stage, kernels, ready - began, clock() - ready])
-    began = clock()
-print(json.dumps(rows))
-"""
-MACHINE = """
-import json, os, pathlib
-import clvoro
-device = clvoro.create_context().devices[0]
-text = pathlib.Path("/proc/cpuinfo").read_text() if os.path.exists("/proc/cpuinfo") else ""
-flags = [name for name in ("avx512f", "avx2") if name in text][:1]
-print(json.dumps(f"{{device.platform.version}}, {{device.name}}, {{os.cpu_count()}} cores, {{' '.join(flags)}}"))
 """
 RECORDER = """
 import json, sys
@@ -197,55 +149,41 @@ def write_record() -> None:
     PLACE.write_text("{\n" + ",\n".join(kinds) + "\n}\n")
 
 
+COLUMNS = {
+    "kind": shown("kind", "s"),
+    "cache": shown("cache", "s"),
+    "programs": shown("programs", "d"),
+    "kernels": shown("kernels", "d"),
+    **{name: shown(name, ".2f") for name in ("import", "adapter", "run")},
+    "processor s, adapter and run": shown("processor", ".2f"),
+}
+
+
 def main() -> None:
     """Print the medians, or write the record."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--repeat", type=int, default=3, help="processes for each kind (3)")
-    parser.add_argument("--warm", action="store_true", help="with full caches as well")
-    parser.add_argument("--programs", action="store_true", help="the processor time of each program")
-    parser.add_argument("--small", action="store_true", help="later runs of small meshes")
-    parser.add_argument("--record", action="store_true", help="write the record of kernels")
-    parser.add_argument("--json", action="store_true", help="print one JSON object per line instead")
-    options = parser.parse_args()
+    options_of = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    options_of.add_argument("--repeat", type=int, default=3, help="processes for each kind (3)")
+    options_of.add_argument("--warm", action="store_true", help="with full caches as well")
+    options_of.add_argument("--record", action="store_true", help="write the record of kernels")
+    options_of.add_argument("--json", action="store_true", help="print one JSON object per line instead")
+    options = options_of.parse_args()
     if options.record:
         write_record()
         return
-    if options.small:
-        for kind, (domain, size) in SMALL.items():
-            wall, busy, host = in_process(AGAIN.format(domain=domain, size=size), None)  # type: ignore[misc]
-            print(
-                f"{kind:22} {wall:5.2f} s, {busy:5.2f} s of processor time, {host:5.2f} s of the thread that launches"
-            )
-        return
-    if not options.json:
-        print(in_process(MACHINE.format(), None))
-        columns = "cache  programs  kernels  import  adapter    run   adapter + run: seconds, of processor time"
-        print(f"kind                {columns}")
-    for kind, (domain, job, call) in KINDS.items():
+    report = Report(options.json, COLUMNS)
+    for kind, (_, _, call) in KINDS.items():
         found: dict[str, list] = {"empty": [], "full": []}
         for _ in range(options.repeat):
             with tempfile.TemporaryDirectory() as cache:
-                code = RUN.format(call=call, given=GIVEN)
-                found["empty"].append(in_process(code, cache))
-                if options.warm:
-                    found["full"].append(in_process(code, cache))
+                for state in found if options.warm else ["empty"]:
+                    found[state].append(in_process(RUN.format(call=call, given=GIVEN), cache))
         for state, runs in found.items():
-            if not runs:
-                continue
-            programs, kernels = runs[0].pop("built")
-            wall, busy = ({name: statistics.median(r[name][i] for r in runs) for name in runs[0]} for i in (0, 1))
-            total, used = (sum(x[name] for name in ("adapter", "run")) for x in (wall, busy))
-            if options.json:
-                print(json.dumps({"kind": kind, "cache": state, **wall, "processor": used, "kernels": kernels}))
-            else:
-                print(
-                    f"{kind:17}   {state:5}  {programs:8}  {kernels:7}  {wall['import']:6.2f}  {wall['adapter']:7.2f}  "
-                    f"{wall['run']:5.2f}   {total:20.2f}  {used:17.2f}"
-                )
-        if options.programs:
-            with tempfile.TemporaryDirectory() as cache:
-                for stage, count, of_program, of_kernels in in_process(PROGRAMS.format(domain=domain, job=job), cache):
-                    print(f"  {stage:36} {of_program:5.2f} s, {count:2} kernels {of_kernels:5.2f} s")
+            if runs:
+                programs, kernels = runs[0].pop("built")
+                wall, busy = ({name: statistics.median(r[name][i] for r in runs) for name in runs[0]} for i in (0, 1))
+                row = {"kind": kind, "cache": state, "programs": programs, "kernels": kernels, **wall}
+                report.add({**row, "processor": busy["adapter"] + busy["run"]}, f"{kind}, {state}")
+    report.finish(heading(clvoro.Adapter(), "First runs, seconds"))
 
 
 if __name__ == "__main__":
