@@ -1,16 +1,14 @@
 """Meshes on the sphere: time, sizes, shapes and what C grids need, quasi-uniform and graded.
 
     python bench/sphere.py [--sizes 40962,163842,655362] [--efforts default] [--graded] [--plane]
-                           [--openings] [--single] [--device NAME] [--dtype float32] [--json]
+                           [--openings] [--device NAME] [--dtype float32] [--json]
 
 Quasi-uniform meshes of given numbers of cells, from random generators ("random") and, as a peer, the bisected
 icosahedron after 100 steps of Lloyd's method ("icosahedral"; numbers of cells 10 * 4^k + 2 only). With `--graded`
 meshes of the Earth with caps of fine cells in the North Atlantic: 27, 9 and 3 km times 9, and 1 : 64, with
 a growth of a tenth and of a fifth per cell. With `--plane` the same numbers of cells in a square, for the cost
 per cell. With `--openings` only small meshes are made, from `SEEDS` seeds each, with and without the opening of
-obtuse triangles at the end of a run; errors are those with it. With `--single` meshes are made in float32 (effort
-"fast"), and the lengths of their edges, from corner to corner, are compared with those of the float64 diagram by the
-same generators.
+obtuse triangles at the end of a run; errors are those with it.
 The first run of each kind builds kernels; times are those of a second run. Processor seconds are those of all cores.
 
 Columns: mean and largest |e|, mean and least Q; obtuse Delaunay triangles and the largest angle; the distance
@@ -144,47 +142,6 @@ def compare_openings(options: Any) -> None:
     report.finish(heading(adapter, "Obtuse triangles, and the largest angle in degrees"))
 
 
-def edges(d: clvoro.Diagram) -> tuple[np.ndarray, np.ndarray]:
-    """Return a number for the cells of each edge, ascending, and its length, from its corners as MPAS files have it."""
-    begin, end = d.vertices[d.half_faces.ends].transpose(1, 0, 2)
-    owner, neighbor = d.half_faces.owner.astype(np.int64), d.neighbors.astype(np.int64)
-    once = np.flatnonzero(owner < neighbor)
-    keys = owner[once] * len(d) + neighbor[once]
-    order = np.argsort(keys)
-    lengths = EARTH.lengths(np.linalg.norm(end - begin, axis=1)[once])
-    return keys[order], lengths[order]
-
-
-def compare_precisions(options: Any) -> None:
-    """Compare the edges of float32 meshes with those of the float64 diagrams by the same generators."""
-    options.dtype = "float32"
-    single, double = make_adapter(options), clvoro.Adapter(clvoro.create_context(options.device))
-    columns = {
-        "cells": lambda r: f"{r['cells']:.0f}",
-        "edges that only one has": lambda r: f"{r['different']:.0f}",
-        "missing vertices": lambda r: f"{r['merged']:.0f}",
-        "shortest edge / h": lambda r: f"{r['shortest']:.3f}",
-        "relative difference of edges, mean, largest": lambda r: f"{r['mean']:.1e}, {r['largest']:.1e}",
-    }
-    report = Report(options.json, columns)
-    for n in options.sizes:
-        made = single.run(EARTH, 1e6, effort="fast", n_cells=n, seed=FIRST_SEED).diagram
-        exact = double.diagram(EARTH, made.points)
-        keys, lengths = zip(*(edges(d) for d in (made, exact)), strict=True)
-        _, one, other = np.intersect1d(*keys, return_indices=True)
-        off = np.abs(lengths[0][one] / lengths[1][other] - 1)
-        row = {
-            "cells": n,
-            "different": len(keys[0]) + len(keys[1]) - 2 * len(one),
-            "merged": 2 * n - 4 - len(made.vertices),
-            "mean": off.mean(),
-            "largest": off.max(),
-            "shortest": lengths[1].min() / (EARTH.measure / n) ** 0.5,
-        }
-        report.add({k: float(v) for k, v in row.items()}, f"float32, {n}")
-    report.finish(heading(single, "Edges of float32 meshes"))
-
-
 def main() -> int:
     options_of = parser(__doc__)
     options_of.add_argument("--sizes", type=counts, default=[40_962, 163_842], help="cells")
@@ -192,11 +149,7 @@ def main() -> int:
     options_of.add_argument("--graded", action="store_true", help="graded meshes, too")
     options_of.add_argument("--plane", action="store_true", help="a square, too")
     options_of.add_argument("--openings", action="store_true", help="only obtuse triangles")
-    options_of.add_argument("--single", action="store_true", help="only edges in float32")
     options = options_of.parse_args()
-    if options.single:
-        compare_precisions(options)
-        return 0
     if options.openings:
         compare_openings(options)
         return 0
