@@ -115,6 +115,15 @@ def make_adapter(options: argparse.Namespace) -> clvoro.Adapter:
         raise SystemExit(f"{type(error).__name__}: {error}") from error
 
 
+def random_points(domain: Any, n: int) -> np.ndarray:
+    """Return n uniform random points in `domain`."""
+    rng, points = np.random.default_rng(7411), np.empty((0, domain.dim))
+    while len(points) < n:
+        more = rng.uniform(domain.lower, domain.upper, (n, domain.dim))
+        points = np.concatenate([points, more[domain.contains(more)]])
+    return domain.nearest(points[:n])
+
+
 def run_ranks(ranks: int, script: Sequence[str], **settings: Any) -> subprocess.CompletedProcess[str]:
     """Run a `script` (file, arguments) under `mpiexec`, a core for each rank, with `settings` of `subprocess.run`."""
     mpiexec = shutil.which("mpiexec", path=Path(sys.executable).parent) or "mpiexec"

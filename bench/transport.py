@@ -1,7 +1,7 @@
 """Prescribed volumes in power diagrams: steps of Newton's method, and time.
 
-    python bench/transport.py [--sizes 1e3,1e4,1e5] [--sizes-3d 1e3,1e4] [--sizes-lake 1e3,1e4]
-                              [--sizes-periodic 1e3,1e4] [--sizes-sphere 1e3,1e4] [--repeat N] [--processor-time]
+    python bench/transport.py [--sizes 1e3,1e4] [--domains square,cube,lake,torus,torus in 3D,sphere]
+                              [--repeat N] [--processor-time]
                               [--picture] [--out DIR] [--device NAME] [--dtype float32] [--json]
 
 Uniform random generators in a unit box with walls, in periodic ones ("torus", in 3D with a tenth of the cells), in a
@@ -20,7 +20,7 @@ import argparse
 from pathlib import Path
 
 import numpy as np
-from _common import PICTURES, Report, best, clock_of, counts, heading, make_adapter, parser, shown
+from _common import PICTURES, Report, best, clock_of, counts, heading, make_adapter, names, parser, random_points, shown
 from _walled import lake
 
 import clvoro
@@ -34,20 +34,19 @@ def graded(points: np.ndarray) -> np.ndarray:
     return 0.02 + ((points - 0.5) ** 2).sum(axis=1)
 
 
-def random_points(domain: clvoro.Box | clvoro.Polygon | clvoro.Sphere, n: int) -> np.ndarray:
-    """Return n uniform random points in `domain`."""
-    rng, points = np.random.default_rng(SEED), np.empty((0, domain.dim))
-    while len(points) < n:
-        more = rng.uniform(domain.lower, domain.upper, (n, domain.dim))
-        points = np.concatenate([points, more[domain.contains(more)]])
-    return domain.nearest(points[:n])
-
-
 def equal(points: np.ndarray) -> np.ndarray:
     return np.ones(len(points))
 
 
 VOLUMES = {"equal": equal, "graded": graded}
+DOMAINS = {
+    "square": lambda: clvoro.Box((0, 0), (1, 1)),
+    "cube": lambda: clvoro.Box((0, 0, 0), (1, 1, 1)),
+    "lake": lambda: lake().domain,
+    "torus": lambda: clvoro.Box((0, 0), (1, 1), periodic=True),
+    "torus in 3D": lambda: clvoro.Box((0, 0, 0), (1, 1, 1), periodic=True),
+    "sphere": lambda: clvoro.Sphere(0.5),
+}
 COLUMNS = {
     "domain": shown("domain", ""),
     "cells": shown("cells", ",d"),
@@ -62,11 +61,8 @@ COLUMNS = {
 
 def make_options() -> argparse.ArgumentParser:
     made = parser(__doc__)
-    made.add_argument("--sizes", type=counts, default=counts("1e3,1e4,1e5"), metavar="N,...")
-    made.add_argument("--sizes-3d", type=counts, default=counts("1e3,1e4"), metavar="N,...")
-    made.add_argument("--sizes-lake", type=counts, default=counts("1e3,1e4"), metavar="N,...")
-    made.add_argument("--sizes-periodic", type=counts, default=counts("1e3,1e4"), metavar="N,...")
-    made.add_argument("--sizes-sphere", type=counts, default=counts("1e3,1e4"), metavar="N,...")
+    made.add_argument("--sizes", type=counts, default=counts("1e3,1e4"), metavar="N,...")
+    made.add_argument("--domains", type=names, default=list(DOMAINS), metavar="NAMES")
     made.add_argument("--repeat", type=int, default=3, metavar="N")
     made.add_argument("--picture", action="store_true", help="draw a picture instead")
     made.add_argument("--out", type=Path, default=PICTURES, metavar="DIR")
@@ -100,16 +96,9 @@ def main(arguments: list[str] | None = None) -> None:
         draw(adapter, options.out)
         return
     report, clock = Report(options.json, COLUMNS), clock_of(options, adapter)
-    domains = {
-        "square": (clvoro.Box((0, 0), (1, 1)), options.sizes),
-        "cube": (clvoro.Box((0, 0, 0), (1, 1, 1)), options.sizes_3d),
-        "lake": (lake().domain, options.sizes_lake),
-        "torus": (clvoro.Box((0, 0), (1, 1), periodic=True), options.sizes_periodic),
-        "torus in 3D": (clvoro.Box((0, 0, 0), (1, 1, 1), periodic=True), [n // 10 for n in options.sizes_periodic]),
-        "sphere": (clvoro.Sphere(0.5), options.sizes_sphere),
-    }
-    for name, (domain, sizes) in domains.items():
-        for n in sizes:
+    for name in options.domains:
+        domain = DOMAINS[name]()
+        for n in options.sizes if name != "torus in 3D" else [n // 10 for n in options.sizes]:
             points = random_points(domain, n)
             for kind, volumes_at in VOLUMES.items():
                 volumes = volumes_at(points)

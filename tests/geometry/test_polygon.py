@@ -11,7 +11,8 @@ import shapely
 import clvoro
 from clvoro.errors import InputError, InputTypeError, MismatchWarning
 from clvoro.opencl.threads import Team
-from tests.reference.polygons import HOLE, OTHER, SQUARE, crossings, distances, ragged
+from tests.reference.polygons import HOLE, OTHER, SQUARE, crossings, distances
+from tests.reference.shores import star
 
 
 def test_rings_are_oriented() -> None:
@@ -118,14 +119,14 @@ def test_equal_domains() -> None:
 def test_area_is_exact() -> None:
     # Far from the origin products of coordinates have 32 digits more than the area.
     far = np.array([2.0**33, -(2.0**33)])
-    ring = (ragged(200) * 2**10).round(6) / 2**10 + far
+    ring = (star(200) * 2**10).round(6) / 2**10 + far
     x = [(Fraction(a), Fraction(b)) for a, b in ring.tolist()]
     twice = sum(a[0] * b[1] - a[1] * b[0] for a, b in zip(x, x[1:] + x[:1], strict=True))
     assert clvoro.Polygon(ring).measure == float(twice / 2)
 
 
 def test_points_are_located() -> None:
-    rings = [ragged(150), ragged(60, 5, (0.05, 0.0), 0.2)]
+    rings = [star(150), star(60, 5, (0.05, 0.0), 0.2)]
     domain = clvoro.Polygon(rings[0], rings[1:])
     x = np.random.default_rng(1).uniform(-1.2, 1.2, (4000, 2))
     inside = crossings(x, rings)
@@ -156,7 +157,7 @@ def test_threads_locate_points_at_the_same_time() -> None:
 
 def test_the_boundary_belongs_to_the_domain() -> None:
     for shift in (0.0, 1e6, -1e-6):
-        domain = clvoro.Polygon(ragged(300) + shift, [ragged(50, 3, (0, 0), 0.2) + shift])
+        domain = clvoro.Polygon(star(300) + shift, [star(50, 3, (0, 0), 0.2) + shift])
         t = np.random.default_rng(2).random((len(domain.vertices), 20, 1))
         a, b = (end[:, None] for end in domain.edge_ends(np.arange(len(t))))
         points = (a + t * (b - a)).reshape(-1, 2)
@@ -283,7 +284,7 @@ def result_of(domain: clvoro.Polygon) -> clvoro.Result:
 
 
 def test_files_hold_the_domain(tmp_path) -> None:
-    domain = clvoro.Polygon.from_pieces([[ragged(40)[::-1], ragged(9, radius=0.1)], [SQUARE + np.pi]])
+    domain = clvoro.Polygon.from_pieces([[star(40)[::-1], star(9, radius=0.1)], [SQUARE + np.pi]])
     path = tmp_path / "mesh.npz"
     result_of(domain).save(path)
     assert clvoro.load(path).diagram.domain == domain

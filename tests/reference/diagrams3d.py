@@ -7,6 +7,24 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import ConvexHull, Voronoi
 
+LATTICES = {
+    "cubic": [[0, 0, 0]],
+    "bcc": [[0, 0, 0], [0.5, 0.5, 0.5]],
+    "fcc": [[0, 0, 0], [0.5, 0.5, 0], [0.5, 0, 0.5], [0, 0.5, 0.5]],
+}
+
+
+def lattice(kind: str, k: int) -> np.ndarray:
+    """`k` cells of one of `LATTICES` along each side of the unit cube; no generator is on a wall."""
+    ijk = np.stack(np.meshgrid(*[np.arange(k)] * 3, indexing="ij"), axis=-1).reshape(-1, 1, 3)
+    return (ijk + np.array(LATTICES[kind]) + 0.25).reshape(-1, 3) / k
+
+
+def directions(n: int, rng: np.random.Generator) -> np.ndarray:
+    """Random unit vectors."""
+    v = rng.standard_normal((n, 3))
+    return v / np.linalg.norm(v, axis=1)[:, None]
+
 
 @dataclass(frozen=True)
 class Cell:

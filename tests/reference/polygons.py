@@ -7,14 +7,6 @@ HOLE = np.array([(1.0, 1), (2, 1), (2, 2), (1, 2)])
 OTHER = HOLE * 0.5 + (2.5, 0.5)
 
 
-def ragged(k: int, seed: int = 11, center=(0.0, 0.0), radius=1.0) -> np.ndarray:
-    """A star-shaped ring of `k` vertices, counter-clockwise."""
-    rng = np.random.default_rng(seed)
-    angle = (np.arange(k) + rng.uniform(0, 0.9, k)) * (2 * np.pi / k)
-    r = radius * rng.uniform(0.5, 1.0, k)
-    return np.column_stack([r * np.cos(angle), r * np.sin(angle)]) + center
-
-
 def crossings(points: np.ndarray, rings: list) -> np.ndarray:
     """Even-odd rule, edge by edge."""
     inside = np.zeros(len(points), bool)

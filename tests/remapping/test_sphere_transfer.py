@@ -12,6 +12,7 @@ from clvoro import Sphere
 from clvoro.errors import InputError
 from clvoro.mesh.diagram import Diagram
 from tests.reference.spheres import UNIT, clustered_points, grid_of_rings, random_points
+from tests.remapping.test_transfer import check_mass_bounds_and_constants, mass_defect
 
 ORDERS = pytest.mark.parametrize("order", [1, 2])
 TURN = np.linalg.qr(np.random.default_rng(12).normal(size=(3, 3)))[0]
@@ -30,12 +31,6 @@ def mesh(adapter):
         return made[n, seed, radius]
 
     return make
-
-
-def mass_defect(old, new, values, carried):
-    whole = (old.volumes * np.abs(values).T).sum(axis=-1)
-    gone = (old.volumes * values.T).sum(axis=-1)
-    return np.abs((new.volumes * carried.T).sum(axis=-1) - gone).max() / whole.max()
 
 
 def corner_rows(points):
@@ -167,15 +162,7 @@ def test_cells_as_wide_as_the_sphere(adapter, counts):
 @pytest.mark.parametrize("counts", [(900, 700), (40, 2000), (2000, 40), (8, 3000), (3000, 8), (9, 8)])
 def test_mass_bounds_and_constants(mesh, adapter, order, radius, counts):
     old, new = mesh(counts[0], 991, radius), mesh(counts[1], 4673, radius)
-    rng = np.random.default_rng(88)
-    q = np.column_stack([rng.normal(size=counts[0]), np.full(counts[0], -2.7), rng.random(counts[0]) > 0.7])
-    got = old.transfer(q, new, order, adapter=adapter)
-    assert got.shape == (counts[1], 3)
-    # The round-off of a sum of a thousand products is about 1e-14.
-    assert mass_defect(old, new, q, got) < 1e-13
-    assert (got >= q.min(axis=0)).all()
-    assert (got <= q.max(axis=0)).all()
-    np.testing.assert_array_equal(got[:, 1], -2.7)
+    check_mass_bounds_and_constants(old, new, order, adapter)
 
 
 @ORDERS

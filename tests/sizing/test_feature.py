@@ -13,7 +13,8 @@ from clvoro.adaptation.sampling.start import sample_uniform
 from clvoro.errors import InputError, InputTypeError
 from clvoro.geometry.gaps import FACING
 from clvoro.opencl.engine import Engine
-from tests.reference.polygons import HOLE, SQUARE, ragged
+from tests.reference.polygons import HOLE, SQUARE
+from tests.reference.shores import star
 
 CIRCLE = np.column_stack([f(np.arange(200) * math.pi / 100) for f in (np.cos, np.sin)])
 
@@ -26,7 +27,7 @@ def inner(domain: clvoro.Polygon, n: int = 4000) -> np.ndarray:
 
 
 def test_distance_to_the_boundary_of_the_domain() -> None:
-    domain = clvoro.Polygon(ragged(60)[::-1], [ragged(20, 5, (0.05, 0.0), 0.2)])
+    domain = clvoro.Polygon(star(60)[::-1], [star(20, 5, (0.05, 0.0), 0.2)])
     x = inner(domain)
     size = sizing.Distance(domain, 0.1, slope=0.5)(x)
     assert np.abs(size - 0.1 - 0.5 * domain.boundary_distance(x)).max() < 1e-15
@@ -121,7 +122,7 @@ def reference(domain: clvoro.Polygon, x: np.ndarray, across: float, slope: float
 @pytest.mark.sparse(1)
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_gaps_of_random_polygons(seed: int) -> None:
-    domain = clvoro.Polygon(ragged(14, seed), [ragged(7, seed + 9, (0.05, 0.0), 0.2)])
+    domain = clvoro.Polygon(star(14, seed), [star(7, seed + 9, (0.05, 0.0), 0.2)])
     x = inner(domain, 300)
     size = sizing.FeatureSize(domain, 4, slope=0.3, h_min=0.02, h_max=0.5, curvature=0)
     h = size(x)
@@ -139,7 +140,7 @@ def test_gaps_of_random_polygons(seed: int) -> None:
 
 
 def test_growth_is_bounded() -> None:
-    domain = clvoro.Polygon(ragged(40), [ragged(20, 5, (0.05, 0.0), 0.2)])
+    domain = clvoro.Polygon(star(40), [star(20, 5, (0.05, 0.0), 0.2)])
     size = sizing.FeatureSize(domain, h_min=0.003, h_max=0.2, growth=1.3)
     rng = np.random.default_rng(4)
     x = rng.uniform(-1, 1, (3000, 2))
@@ -174,7 +175,7 @@ def test_number_of_cells_per_radius_of_curvature() -> None:
 @pytest.mark.sparse(1)
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
 def test_device_and_host_agree(ctx, dtype: str) -> None:
-    domain = clvoro.Polygon(ragged(40) + 100, [ragged(20, 5, (100.05, 100.0), 0.2)])
+    domain = clvoro.Polygon(star(40) + 100, [star(20, 5, (100.05, 100.0), 0.2)])
     size = sizing.FeatureSize(domain, h_min=0.003, h_max=0.2)
     engine = Engine(ctx, cl.CommandQueue(ctx), 2, np.dtype(dtype))
     x = inner(domain)
@@ -206,7 +207,7 @@ def test_bad_input(options: dict, says: str) -> None:
 
 def test_graded_fields_are_evaluated_inside_only() -> None:
     """A jump becomes a ramp, and values of the field outside are not used."""
-    domain = clvoro.Polygon(ragged(60), [ragged(20, 5, (0.05, 0.0), 0.2)])
+    domain = clvoro.Polygon(star(60), [star(20, 5, (0.05, 0.0), 0.2)])
 
     def jump(x: np.ndarray) -> np.ndarray:
         assert domain.contains(x).all()

@@ -13,13 +13,9 @@ from clvoro.tessellation.bins import Bins
 from clvoro.tessellation.part import Part
 from clvoro.tessellation.polyhedra import Polyhedra
 from tests.reference import diagrams3d as reference3d
+from tests.reference.diagrams3d import LATTICES, directions, lattice
 
 BOX = clvoro.Box((0.0, 0.0, 0.0), (2.0, 1.5, 1.0))
-LATTICES = {
-    "cubic": [[0, 0, 0]],
-    "bcc": [[0, 0, 0], [0.5, 0.5, 0.5]],
-    "fcc": [[0, 0, 0], [0.5, 0.5, 0], [0.5, 0, 0.5], [0, 0.5, 0.5]],
-}
 
 
 @pytest.fixture(scope="module", params=["float64", "float32"])
@@ -32,11 +28,6 @@ def adapter64():
     return clvoro.Adapter(dtype="float64")
 
 
-def lattice(kind, k):
-    ijk = np.stack(np.meshgrid(*[np.arange(k)] * 3, indexing="ij"), axis=-1).reshape(-1, 1, 3)
-    return (ijk + np.array(LATTICES[kind]) + 0.25).reshape(-1, 3) / k * BOX.extent
-
-
 def hexagonal(k, close_packed):
     j, i, layer = np.meshgrid(*[np.arange(k)] * 3, indexing="ij")
     if close_packed:
@@ -46,11 +37,6 @@ def hexagonal(k, close_packed):
         points = np.stack([i + j % 2 / 2, np.sqrt(0.75) * j, layer], axis=-1)
     points = points.reshape(-1, 3) + 0.4
     return points / (points.max() + 0.4) * BOX.extent.min()
-
-
-def directions(n, rng):
-    v = rng.standard_normal((n, 3))
-    return v / np.linalg.norm(v, axis=1)[:, None]
 
 
 def point_sets():
@@ -69,9 +55,9 @@ def point_sets():
         "random": rng.random((300, 3)) * extent,
         # The reference needs mirror images that differ from their points.
         "graded": (0.02 + 0.96 * rng.random((400, 3)) ** 3) * extent,
-        "cubic": lattice("cubic", 5),
-        "bcc": lattice("bcc", 4),
-        "fcc": lattice("fcc", 4),
+        "cubic": lattice("cubic", 5) * extent,
+        "bcc": lattice("bcc", 4) * extent,
+        "fcc": lattice("fcc", 4) * extent,
         "hexagonal": hexagonal(5, close_packed=False),
         "close-packed": hexagonal(5, close_packed=True),
         "sphere": sphere,
@@ -198,7 +184,7 @@ def test_lattices_off_by_round_off(adapter, kind, roundings):
     """Up to eight cells nearly meet at a vertex: from ties to faces that are hundreds of eps wide."""
     rng = np.random.default_rng(8231)
     cube, eps = clvoro.Box((0, 0, 0), (1, 1, 1)), float(np.finfo(adapter.dtype).eps)
-    straight = lattice(kind, 5 if kind == "cubic" else 3) / BOX.extent
+    straight = lattice(kind, 5 if kind == "cubic" else 3)
     turn, _ = np.linalg.qr(rng.standard_normal((3, 3)))
     for points in (straight, 0.5 + 0.55 * (straight - 0.5) @ turn):
         diagram = adapter.diagram(cube, points + roundings * eps * rng.standard_normal(points.shape))
@@ -257,7 +243,7 @@ def test_volumes_of_points_on_walls(adapter64, name):
 )  # cube, truncated octahedron, rhombic dodecahedron
 def test_cells_of_a_lattice(adapter, kind, count):
     cube = clvoro.Box((0, 0, 0), (1, 1, 1))
-    diagram = adapter.diagram(cube, lattice(kind, 5) / BOX.extent)
+    diagram = adapter.diagram(cube, lattice(kind, 5))
     # Cells two layers away from the walls are those of an infinite lattice.
     inner = (np.abs(diagram.points - 0.5) < 0.27).all(axis=1)
     assert inner.sum() >= 8

@@ -20,9 +20,10 @@ from clvoro.tessellation import back_ends
 from clvoro.tessellation.bins import Bins
 from clvoro.tessellation.part import Part
 from clvoro.tessellation.polyhedra import Polyhedra
+from tests.reference.diagrams3d import directions
 from tests.robustness.gpu_like import by_teams, groups
 from tests.tessellation import test_updates_3d as updates
-from tests.tessellation.test_polyhedra import BOX, POINTS, directions
+from tests.tessellation.test_polyhedra import BOX, POINTS
 
 ARRAYS = ("starts", "neighbors", "face_measures", "face_centroids", "volumes", "offsets", "covariances")
 

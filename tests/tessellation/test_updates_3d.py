@@ -14,6 +14,7 @@ from clvoro.tessellation.device_diagram import read_report
 from clvoro.tessellation.part import Part
 from clvoro.tessellation.tessellator import Tessellator
 from tests.reference import patch
+from tests.reference.diagrams3d import lattice
 
 BOX = clvoro.Box((0, 0, 0), (1, 1, 0.75))
 UNIT = clvoro.Box((0, 0, 0), (1, 1, 1), periodic=True)
@@ -22,22 +23,17 @@ N = 900
 real = pytest.mark.parametrize("real", ["float64", "float32"])
 
 
-def lattice(offsets, k):
-    ijk = np.stack(np.meshgrid(*[np.arange(k)] * 3, indexing="ij"), axis=-1).reshape(-1, 1, 3)
-    return BOX.extent * (ijk + np.array(offsets) + 0.25).reshape(-1, 3) / k
-
-
 def point_sets():
     rng = np.random.default_rng(52817)
     random = BOX.extent * rng.random((N, 3))
     on_walls = random[:200].copy()
     on_walls[:, 2] = np.where(on_walls[:, 2] < 0.4, 0, 0.75)
-    bcc = lattice([[0, 0, 0], [0.5, 0.5, 0.5]], 7)
+    bcc = BOX.extent * lattice("bcc", 7)
     return {
         "random": random,
         "graded": BOX.extent * rng.random((N, 3)) ** 2,
         "clusters": np.concatenate([random[:400], 0.3 + 0.02 * random[400:]]),
-        "cubic": lattice([[0, 0, 0]], 9),
+        "cubic": BOX.extent * lattice("cubic", 9),
         "bcc": bcc,
         "nearly bcc": bcc + 1e-3 * rng.standard_normal(bcc.shape),
         "on walls": np.concatenate([on_walls, random[200:600]]),

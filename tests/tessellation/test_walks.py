@@ -11,6 +11,7 @@ from clvoro.tessellation.polyhedra import CUBE as CUBE_SIDE
 from clvoro.tessellation.polyhedra import FIRST_REACH, STRETCH, Polyhedra
 from clvoro.tessellation.polyhedra_update import PolyhedraUpdate
 from tests.reference import diagrams3d as reference3d
+from tests.reference.diagrams3d import directions, lattice
 
 CUBE = clvoro.Box((0, 0, 0), (1, 1, 1))
 UNFINISHED, CERTAIN = np.iinfo(np.int32).min, 1 << 30
@@ -25,20 +26,10 @@ def engine(ctx):
     return made
 
 
-def lattice(cell, k):
-    ijk = np.stack(np.meshgrid(*[np.arange(k)] * 3, indexing="ij"), axis=-1).reshape(-1, 1, 3)
-    return (ijk + np.array(cell) + 0.25).reshape(-1, 3) / k
-
-
-def directions(rng, n):
-    v = rng.standard_normal((n, 3))
-    return v / np.linalg.norm(v, axis=1)[:, None]
-
-
 def point_sets():
     rng = np.random.default_rng(34603)
     random = rng.random((4000, 3))
-    bcc = lattice([[0, 0, 0], [0.5, 0.5, 0.5]], 6)
+    bcc = lattice("bcc", 6)
     spot = np.array([0.4, 0.3, 0.6])
     shell = np.exp(-6 * rng.random((2000, 1)))
     hollow = 0.02 * np.exp(3.2 * rng.random((3000, 1)))
@@ -47,27 +38,27 @@ def point_sets():
         "random": random,
         "cubed": rng.random((2000, 3)) ** 3,
         # Cells around the empty ball reach its center.
-        "hollow": np.clip(0.5 + hollow * directions(rng, 3000), 0, 1),
-        "radial": np.clip(spot + 0.6 * shell * directions(rng, 2000), 0, 1),
+        "hollow": np.clip(0.5 + hollow * directions(3000, rng), 0, 1),
+        "radial": np.clip(spot + 0.6 * shell * directions(2000, rng), 0, 1),
         "clusters": np.concatenate(
             [spot + s * (rng.random((300, 3)) - 0.5) for s in (1e-2, 1e-4, 1e-6)] + [random[:50]]
         ),
         # Cells as long as the box with neighbors at a thousandth of that: edges lie on bisectors up to a few eps.
         "spots": np.clip(random[:150].repeat(20, axis=0) + 1e-3 * rng.standard_normal((3000, 3)), 1e-6, 1),
         "a dense and an empty half": np.concatenate([random[:2000] * [0.3, 1, 1], [[0.99, 0.7, 0.2]]]),
-        "cubic": lattice([[0, 0, 0]], 8),
+        "cubic": lattice("cubic", 8),
         "bcc": bcc,
         "bcc, rounded": bcc + 1e-15 * rng.standard_normal(bcc.shape),
         "bcc, nearly": bcc + 1e-9 * rng.standard_normal(bcc.shape),
         "bcc, jittered": bcc + 0.02 * (rng.random(bcc.shape) - 0.5),
-        "fcc": lattice([[0, 0, 0], [0.5, 0.5, 0], [0.5, 0, 0.5], [0, 0.5, 0.5]], 5),
+        "fcc": lattice("fcc", 5),
         "to the walls": np.array(list(np.ndindex(6, 6, 6))) / 5,
-        "sphere and center": np.concatenate([0.5 + 0.4 * directions(rng, 60), [[0.5, 0.5, 0.5]]]),
+        "sphere and center": np.concatenate([0.5 + 0.4 * directions(60, rng), [[0.5, 0.5, 0.5]]]),
         "line": np.linspace([0.01, 0.02, 0.03], [0.99, 0.9, 0.8], 300),
         "plane": np.column_stack([random[:500, :2], np.full(500, 0.3)]),
         "near walls": np.concatenate([random[:300] * [1, 1, 1e-5], random[300:900]]),
         "pairs": np.concatenate([random[:500], random[:500] + 1e-6 * (random[500:1000] - 0.5)]),
-        "few and a cluster": np.concatenate([random[:20], 0.5 + 0.05 * directions(rng, 3000) * rng.random((3000, 1))]),
+        "few and a cluster": np.concatenate([random[:20], 0.5 + 0.05 * directions(3000, rng) * rng.random((3000, 1))]),
         # Of some there walls were the nearest at first, and what a cell was walked from once more lay outside of it.
         **{f"clump {seed}": clump(seed) for seed in (165, 2459, 7147)},
     }

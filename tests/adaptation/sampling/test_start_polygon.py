@@ -10,9 +10,10 @@ from clvoro.adaptation.sampling.coverage import PolygonCoverage
 from clvoro.adaptation.sampling.quadrature import DensityTree
 from clvoro.adaptation.sampling.start import count_cells, sample_density, sample_uniform
 from clvoro.errors import InputError
-from tests.reference.polygons import HOLE, SQUARE, crossings, ragged
+from tests.reference.polygons import HOLE, SQUARE, crossings
+from tests.reference.shores import star
 
-ANNULUS = clvoro.Polygon(ragged(400), [ragged(90, 5, (0.05, 0.0), 0.2)])
+ANNULUS = clvoro.Polygon(star(400), [star(90, 5, (0.05, 0.0), 0.2)])
 NEEDLE = clvoro.Polygon([(0, 0), (1e-3, 0), (3, 2), (3, 2 + 1e-3)])  # along a diagonal
 PIECES = clvoro.Polygon.from_pieces(
     [[SQUARE, HOLE], [SQUARE * 1e-3 + 7], [HOLE * 0.5 + (0.75, 0.75)], [SQUARE[::-1] + np.array([4, 3])]]
@@ -20,7 +21,7 @@ PIECES = clvoro.Polygon.from_pieces(
 DOMAINS = {"annulus": ANNULUS, "needle": NEEDLE, "pieces": PIECES}
 GROWING = sizing.Expression("0.01 + 0.1 * hypot(x - 0.6, y)")
 DIP = sizing.Distance(sizing.Segment((-2, 0.1), (2, 0.4)), 0.01, slope=0.1)
-STAR = clvoro.Polygon(ragged(50), [ragged(11, 5, (0.05, 0.0), 0.2)])
+STAR = clvoro.Polygon(star(50), [star(11, 5, (0.05, 0.0), 0.2)])
 
 
 def guarded(domain: clvoro.Polygon, field):
