@@ -8,9 +8,6 @@ largest non-orthogonality and skewness that `checkMesh` prints, the number of co
 a cell is concave, the error and quality of cells on walls and of the others, and the verdict. Without OpenFOAM the
 script ends with a message. Debian's package `openfoam` is enough.
 
-With --seeds there is one row per domain and run, for all seeds: how many meshes are accepted, and the worst figures.
-`--seeds 6` is short for `--seeds 1,2,3,4,5,6`. Processor times are those of the run, and of making the solver mesh.
-
 The domains are in `bench/_walled.py` and `bench/_sites.py`. S3 has 1e5 cells; S2 and S3 run with their default effort
 only, unless they are named in --only.
 """
@@ -100,46 +97,6 @@ COLUMNS = {
 }
 
 
-WORST = {
-    "non_orthogonality": max,
-    "skewness": max,
-    "concave": max,
-    "concave_degrees": max,
-    "shortest": min,
-    "wall_error": max,
-    "wall_quality": min,
-    "inner_error": max,
-    "inner_quality": min,
-}
-SEED_COLUMNS = {
-    "domain": lambda r: r["domain"],
-    "run": lambda r: r["run"],
-    "accepted": lambda r: f"{r['accepted']} of {r['meshes']}",
-    "within 20 degrees and 2": lambda r: f"{r['within']} of {r['meshes']}",
-    **{name: COLUMNS[name] for name in list(COLUMNS)[4:-1]},
-    "processor s": lambda r: f"{r['seconds']:.1f}, {r['solver_mesh_seconds']:.2f}",
-    "refused": lambda r: r["refused"],
-}
-"""Columns of the rows for several seeds: worst figures, means of times."""
-
-
-def over_seeds(rows: list[dict[str, Any]]) -> dict[str, Any]:
-    """Return one row for meshes that differ in their seeds only."""
-    refused = [f"seed {r['seed']}: {r['complaints'][:60]}" for r in rows if not r["ok"]]
-    times = ("seconds", "solver_mesh_seconds")
-    return {
-        "domain": rows[0]["domain"],
-        "run": rows[0]["run"],
-        "meshes": len(rows),
-        "accepted": len(rows) - len(refused),
-        "ok": not refused,
-        "within": sum(r["ok"] and r["non_orthogonality"] <= 20 and r["skewness"] <= 2 for r in rows),
-        **{name: worst(r[name] for r in rows) for name, worst in WORST.items()},
-        **{name: sum(r[name] for r in rows) / len(rows) for name in times},
-        "refused": "; ".join(refused),
-    }
-
-
 def main() -> None:
     """Run the bench."""
     options_of = parser(__doc__)
@@ -153,7 +110,7 @@ def main() -> None:
     require("checkMesh")
     adapter = make_adapter(options)
     seeds = seeds_of(options.seeds)
-    report = Report(options.json, SEED_COLUMNS if seeds else COLUMNS)
+    report = Report(options.json, COLUMNS)
     chosen = options.only.split(";") if ";" in options.only else names(options.only)
     if options.only in DOMAINS:
         chosen = [options.only]  # names have commas
@@ -164,31 +121,24 @@ def main() -> None:
         for run, settings in runs:
             if name in LARGE and run != "default" and not chosen:
                 continue
-            rows = []
             for seed in seeds or [None]:
-                begin, used = time.perf_counter(), time.process_time()
-                chosen_seed = {} if seed is None else {"seed": seed}
+                chosen_seed, part = ({}, "") if seed is None else ({"seed": seed}, f", {seed}")
+                label = f"{name}-{run}{part}".replace(", ", "-").replace(" ", "-")
+                begin = time.perf_counter()
                 result = adapter.run(domain, size, **{**more, **settings, **chosen_seed})
                 seconds = time.perf_counter() - begin
-                seconds = seconds if seed is None else time.process_time() - used
-                part = "" if seed is None else f"-{seed}"
-                label = f"{name}-{run}{part}".replace(", ", "-").replace(" ", "-")
                 with tempfile.TemporaryDirectory() as folder:
                     row = measure(result, Path(folder) if options.keep is None else options.keep / label)
                 if options.pictures is not None and domain.dim == 2:
                     options.pictures.mkdir(parents=True, exist_ok=True)
                     figure = result.plot(title=f"{name}, {run}")
                     figure.savefig(options.pictures / f"{label}.png", dpi=200)
-                rows.append({"domain": name, "run": run, "seed": seed, "seconds": seconds, **row})
-            if seeds:
-                row = over_seeds(rows)
-                report.add(row, f"{name}, {run}: {row['accepted']} of {len(rows)} {row['refused']}")
-            else:
-                row = rows[0]
-                report.add(row, f"{name}, {run}: {'OK' if row['ok'] else row['complaints']}")
-    good = sum(row.get("accepted", row["ok"]) for row in report.records)
-    total = sum(row.get("meshes", 1) for row in report.records)
-    report.finish(heading(adapter, f"{good} of {total} meshes pass checkMesh"))
+                report.add(
+                    {"domain": name, "run": f"{run}{part}", "seconds": seconds, **row},
+                    f"{label}: {'OK' if row['ok'] else row['complaints']}",
+                )
+    good = sum(row["ok"] for row in report.records)
+    report.finish(heading(adapter, f"{good} of {len(report.records)} meshes pass checkMesh"))
 
 
 if __name__ == "__main__":
