@@ -499,7 +499,7 @@ class PartSteps(DomainSteps):
     def update(
         self, sites: cla.Array, n: int, previous: Tessellation, sort: Sort, follow: Follow
     ) -> Tessellation | None:
-        """Update `previous`, in 2D with the cells of ghosts; all parts do it, or none."""
+        """Update `previous`, in 2D with the cells of ghosts; a part whose cells change too much makes them anew."""
         stages, self.rounds = self.stages, 0
         part = self.extend(sites, n)
         before = previous.whole or previous
@@ -519,6 +519,9 @@ class PartSteps(DomainSteps):
             t = stages.update.update(stages.cells, self.box, part.points, before, clip=clip)
         if t is not None:
             part.order_rows(stages.engine, t, stages.cells.defines)
+        else:
+            binned = stages.bins.build(self.box, part.points, part.count)
+            t = stages.cells.tessellate(part, binned, exact=False, rows=part.count if self._reads_rows else n)
         made = self._finished(part, t)
         if made is not None:
             follow(made, None)
