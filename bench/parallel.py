@@ -1,14 +1,14 @@
 """Runs over the ranks of MPI: bits, sizes and shapes, processor time, and what ranks exchange.
 
     python bench/parallel.py [--ranks 1,2,4,8] [--cells 10000] [--dims 2,3] [--effort fast] [--periodic]
-                             [--sphere] [--device NAME] [--dtype float32] [--json]
+                             [--sphere] [--polygon] [--device NAME] [--dtype float32] [--json]
 
 For each number of ranks the script starts itself under `mpiexec`; with PoCL each rank has one core. `bits` says whether
 the diagram of random points has the same bits as with the first number of ranks. The other columns are of a run in a
-box, or on a sphere, with sizes from h to 3 h, after a run of fewer cells, which builds kernels. `CPU s` is its
-processor time, summed over ranks, and `over one` the ratio to that of the first number of ranks. `floor` is the same
-ratio for as many processes at the same time that each make a mesh of n / p cells without messages: it has the cost of
-the fixed work of a step, and of shared cores and caches. `exchanges` and `reductions` are the rounds of messages
+box, on a sphere, or in a lake, with sizes from h to 3 h, after a run of fewer cells, which builds kernels. `CPU s` is
+its processor time, summed over ranks, and `over one` the ratio to that of the first number of ranks. `floor` is the
+same ratio for as many processes at the same time that each make a mesh of n / p cells without messages: it has the cost
+of the fixed work of a step, and of shared cores and caches. `exchanges` and `reductions` are the rounds of messages
 between pairs of ranks, and of sums over all ranks, per step in which all ranks work. Some of both take place at the
 same time; `waits` counts how often a rank waits for others. `ghosts` is the number of ghosts of rank 0 in the last
 diagram over 2 d (n / p)^((d - 1) / d), an estimate of one layer of cells around a part. `one round` is the share of
@@ -26,6 +26,7 @@ import time
 
 import numpy as np
 from _common import Report, counts, parser, run_ranks, shown
+from _kinds import COAST
 
 import clvoro
 from clvoro.adaptation.run import Run
@@ -56,8 +57,9 @@ def measure_rank(options: argparse.Namespace) -> None:
 
     dim, cells, effort, comm = options.rank, options.cells, options.effort, MPI.COMM_WORLD
     rounds, ghosts, asked, box = [], [0], [0], clvoro.Box((0,) * dim, (1,) * dim, periodic=options.periodic)
-    x, domain = np.random.default_rng(1).random((cells, dim)), clvoro.Sphere(0.5) if options.sphere else box
-    x, dim = x - 0.5 * options.sphere, domain.cell_dim
+    domain = clvoro.Sphere(0.5) if options.sphere else COAST if options.polygon else box
+    x, dim = np.random.default_rng(1).random((cells, dim)) - 0.5 * options.sphere, domain.cell_dim
+    x = x[domain.contains(x)] if options.polygon else x
     adapter = clvoro.Adapter(clvoro.create_context(options.device), options.dtype, comm=comm)
     peers = adapter._peers
     finish = PartSteps._finished
@@ -134,12 +136,13 @@ def main() -> None:
     p.add_argument("--effort", default="fast", help="effort of the run")
     p.add_argument("--periodic", action="store_true", help="a box without walls")
     p.add_argument("--sphere", action="store_true", help="a sphere in place of boxes")
+    p.add_argument("--polygon", action="store_true", help="a lake in place of boxes")
     p.add_argument("--rank", type=int, help="dimension for which each rank measures; used by the script itself")
     options = p.parse_args()
     if options.rank:
         measure_rank(options)
         return
-    for dim in [3] if options.sphere else options.dims:
+    for dim in [3] if options.sphere else [2] if options.polygon else options.dims:
         table, first = Report(options.json, COLUMNS), {}
         for ranks in options.ranks:
             found = run_ranks(ranks, [__file__, *sys.argv[1:], "--rank", str(dim)], check=True)

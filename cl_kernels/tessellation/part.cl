@@ -21,14 +21,15 @@ inline REAL weight_of_face(int a, int b)
 
 /* Radius of the ball around generator i in which its part must know all generators. The radius is `factor` times the
    reach of the cell. If the cells of ghosts must be final, too (`with_ghosts`), the ball also contains the balls of the
-   ghosts beside the cell. */
-inline REAL certified_radius(int i, int n, int with_ghosts, REAL factor, global const int *starts,
+   ghosts beside the cell, generators n to rows - 1. Where a boundary cuts cells, these are the convex cells, with the
+   reach of what is in the domain. */
+inline REAL certified_radius(int i, int n, int rows, int with_ghosts, REAL factor, global const int *starts,
                              global const int *neighbors, global const float *reach, global const REAL *points)
 {
     REAL radius = factor * reach[i];
-    for (int k = with_ghosts && i < n ? starts[i] : starts[i + 1]; k < starts[i + 1]; ++k) {
+    for (int k = with_ghosts ? starts[i] : starts[i + 1]; k < starts[i + 1]; ++k) {
         const int j = neighbors[k];
-        if (j < n)
+        if (j < n || j >= rows)
             continue;
         REAL way2 = 0;
         for (int a = 0; a < DIM; ++a) {
@@ -91,41 +92,33 @@ kernel void place_unfolded(const int size, global const REAL *points, const REAL
     }
 }
 
-#define UNCROSSED 0x7fffffff
-
 /* sums[5 t ...] = the volumes of the generators t, t + size, ... of n; the weighted measures of their faces with
    ghosts, positive in the cell of the lower label; those without signs; how many of these generators are beyond their
    limits; and how many neighbors are half a period away or farther. Over all parts the second sum is zero if each face
    has both sides. One work-item per t.
 
    needed[i] is the radius above. When generator i was at at[i], its part knew all generators within limits[i].s0 of it,
-   and it was at least limits[i].s1 away from the balls of other parts that do not know it.
-
-   Where a boundary cuts cells, each part traces all of it. So the cells that it crosses, slots[i] != UNCROSSED, must be
-   final in all parts: those of ghosts up to row `rows`, too. */
-kernel void sum_cells(const int size, const int n, const int rows, global const int *slots, global const int *starts,
-                      global const int *neighbors, global const int *labels, global const FACE *face_measures,
-                      global const REAL *volumes, const int with_ghosts, const REAL factor, global const float *reach,
-                      global const REAL *points, global const REAL *at, global const float2 *limits,
-                      global float *needed, const REAL4 periods, global REAL *sums)
+   and it was at least limits[i].s1 away from the balls of other parts that do not know it. */
+kernel void sum_cells(const int size, const int n, const int rows, global const int *convex_starts,
+                      global const int *convex_neighbors, global const int *starts, global const int *neighbors,
+                      global const int *labels, global const FACE *face_measures, global const REAL *volumes,
+                      const int with_ghosts, const REAL factor, global const float *reach, global const REAL *points,
+                      global const REAL *at, global const float2 *limits, global float *needed, const REAL4 periods,
+                      global REAL *sums)
 {
     WORK_ITEM(t);
     REAL volume = 0, signed_sum = 0, sum = 0, beyond = 0, far = 0;
-    for (int i = t; i < rows; i += size) {
-        needed[i] = 0;
-        if (i >= n && slots[i] == UNCROSSED)
-            continue;
+    for (int i = t; i < n; i += size) {
         REAL moved2 = 0;
         for (int a = 0; a < DIM; ++a) {
             const REAL d = points[DIM * i + a] - at[DIM * i + a];
             moved2 += d * d;
         }
         const REAL moved = sqrt(moved2);
-        const REAL radius = certified_radius(i, n, with_ghosts, factor, starts, neighbors, reach, points);
+        const REAL radius =
+            certified_radius(i, n, rows, with_ghosts, factor, convex_starts, convex_neighbors, reach, points);
         needed[i] = (float)(radius * (1 + R(1e-6)));
-        beyond += !(radius + moved <= limits[i].s0 && (i >= n || moved <= limits[i].s1));
-        if (i >= n)
-            continue;
+        beyond += !(radius + moved <= limits[i].s0 && moved <= limits[i].s1);
         volume += volumes[i];
         for (int k = starts[i]; k < starts[i + 1]; ++k) {
             const int j = neighbors[k];

@@ -213,26 +213,22 @@ class Part:
         with_ghosts: bool,
         needed: cla.Array,
         periods: np.ndarray,
-        slots: cla.Array | None = None,
     ) -> np.ndarray:
         """Return sums over own cells that prove, with those of all parts, that `t` is a part of the whole diagram.
 
         Parameters
         ----------
-        at, limits : (rows, d) real, (rows, 2) float32
+        at, limits : (n_own, d) real, (n_own, 2) float32
             Of each generator an earlier position, the radius around it within which all generators are known, and how
             far the generator may move from it.
         factor : float
             Radius of the ball in which all generators must be known, over the reach of a cell.
         with_ghosts : bool
             Whether the cells of ghosts beside own cells must be final, too.
-        needed : (rows,) float32
+        needed : (n_own,) float32
             Receives the radii of the balls around own generators in which all generators must be known.
         periods : (4,) real
             Lengths of the periods; 0 between walls.
-        slots : (count,) int32, optional
-            Where a boundary cuts cells; see `Chords`. The cells of ghosts that it crosses must then be final, too:
-            `rows` is `count`, otherwise `n_own`.
 
         Returns
         -------
@@ -245,8 +241,9 @@ class Part:
         given = t.starts, t.neighbors, self.labels, t.face_measures, t.volumes
         limited = np.int32(with_ghosts), engine.real.type(factor), t.reach, self.points, at, limits, needed, periods
         kernel = engine.kernels("tessellation/part", shared=True).sum_cells
-        rows = (self.n_own, t.starts) if slots is None else (self.count, slots)
-        engine.run_each(kernel, SUMS, np.int32(self.n_own), np.int32(rows[0]), rows[1], *given, *limited, sums)
+        convex = t if t.trimmed is None else t.trimmed.convex
+        rows = np.int32(self.n_own), np.int32(self.count), convex.starts, convex.neighbors
+        engine.run_each(kernel, SUMS, *rows, *given, *limited, sums)
         return sums.get().sum(axis=0, dtype=float)
 
     def forward(self, engine: Engine, *values: cla.Array, sums: PartialSums | None = None) -> np.ndarray:

@@ -43,8 +43,6 @@ FIRST_REACH = {(3, 3): 2.5, (2, 2): 3.3, (3, 2): 3.0}
 """Radius of the first balls over the spacing of the generators around, by the dimensions of space and cells. Where
 cells have two, those of neighboring ghosts must be final, too. On a sphere the spacing is overestimated: bins are cubes
 in space."""
-BOUNDARY_REACH = 2.4
-"""The same for cells that a boundary cuts, in all parts."""
 LAST_LABEL = 2**31 - 1
 """Label of the first ghost generator outside of a polygon; the others have those before it."""
 RUN, AHEAD = 32, 4
@@ -140,16 +138,6 @@ class Chunks:
         self.groups = np.empty(n, np.int32)
         self.groups[self.order] = np.repeat(np.arange(len(self.firsts)), np.diff(np.append(self.firsts, n)))
 
-    def joined(self, points: np.ndarray) -> Chunks:
-        """Return these chunks and those of further `points` (k, d)."""
-        if not len(points):
-            return self
-        found = Chunks(points, float(self.spacings.min()))
-        found.order = np.concatenate([self.order, len(self.order) + found.order])
-        found.groups = np.concatenate([self.groups, len(self.firsts) + found.groups])
-        found.firsts = np.concatenate([self.firsts, len(self.order) + found.firsts])
-        return found
-
 
 class BallGroups:
     """The balls in which a part has to know all generators. The balls around the generators of a chunk are a group.
@@ -239,8 +227,6 @@ class Answers:
 
     Attributes
     ----------
-    rows : (k,) int
-        Rows of this part that have balls: its own generators, and ghosts at a boundary that cuts cells.
     balls : BallGroups
         Those of this part.
     asked : (m,) int
@@ -254,7 +240,6 @@ class Answers:
         positions (of the image, in a periodic box), and the number of the image.
     """
 
-    rows: np.ndarray
     balls: BallGroups
     asked: np.ndarray
     facing: dict[int, Facing]
@@ -407,17 +392,14 @@ class PartSteps(DomainSteps):
         """Return `part` with the ghost generators outside of a polygon."""
         if self._cut is None or not self._n_outside:
             return part
-        engine, count = self.stages.engine, part.count + self._n_outside
-        points = part.points
+        engine, n, count = self.stages.engine, part.count, part.count + self._n_outside
+        points, labels = part.points, self._room("labels", size=count, dtype=np.int32)
         if part.ghosts is None:
             points = self._room("points", size=count * engine.dim).reshape(count, -1)
-            cl.enqueue_copy(
-                engine.queue, buffer_of(points), buffer_of(part.points), byte_count=part.points[: part.count].nbytes
-            )
-        engine.send(self._cut.outside, points, part.count * engine.dim * engine.real.itemsize)
-        labels = self._room("labels", size=count, dtype=np.int32)
-        cl.enqueue_copy(engine.queue, buffer_of(labels), buffer_of(part.labels), byte_count=4 * part.count)
-        engine.send(LAST_LABEL - np.arange(self._n_outside, dtype=np.int32), labels, 4 * part.count)
+            cl.enqueue_copy(engine.queue, buffer_of(points), buffer_of(part.points), byte_count=part.points[:n].nbytes)
+        engine.send(self._cut.outside, points, n * engine.dim * engine.real.itemsize)
+        cl.enqueue_copy(engine.queue, buffer_of(labels), buffer_of(part.labels), byte_count=4 * n)
+        engine.send(LAST_LABEL - np.arange(self._n_outside, dtype=np.int32), labels, 4 * n)
         return replace(part, count=count, points=points, labels=labels)
 
     def _begin_anew(self, x: np.ndarray, labels: cla.Array) -> None:
@@ -426,51 +408,36 @@ class PartSteps(DomainSteps):
         self._labels, self._chunks = labels, Chunks(x, least)
         self._sent = [np.empty(0, np.int32) for _ in range(self.peers.count * len(self._shifts))]
         self._sides, self._rows = np.empty(0, int), np.empty(0, np.int32)
+        self._share_landmarks(x)
         self._caps = FIRST_REACH[self.domain.dim, self.domain.cell_dim] * self._chunks.spacings
-        x = np.concatenate([x, self._share_landmarks(x)])
         self._take(self._ask(x, self._caps, self._caps))
 
-    def _share_landmarks(self, x: np.ndarray) -> np.ndarray:
-        """Give the generators nearest to the landmarks to all parts; own ones are at `x` (n, d).
-
-        Return the positions of those of other parts.
-        """
+    def _share_landmarks(self, x: np.ndarray) -> None:
+        """Give the generators nearest to the landmarks of the domain to all parts; own ones are at `x` (n, d)."""
         if self._cut is None:
             places = self.domain.place(self.domain.landmarks, self.stages.engine.real)
-            spacings = np.zeros(len(places))
         else:
-            places, spacings = self._cut.landmarks()
+            places = self._cut.landmarks()
         if not len(places):
-            return x[:0]
-        nearest = np.full((len(places), 2 + x.shape[1]), np.inf)
+            return
+        nearest = np.full((len(places), 2), np.inf)
         if len(x):
-            away, rows = scipy.spatial.cKDTree(x).query(places)
-            nearest = np.column_stack([away, rows, x[rows]])
-        found, told = np.array(self.peers.gather(nearest)), [x[:0]]
+            nearest = np.column_stack(scipy.spatial.cKDTree(x).query(places))
+        found = np.array(self.peers.gather(nearest))
         owners = found[:, :, 0].argmin(axis=0)
         for number in np.unique(owners):
-            mine = owners == number
-            rows, first, which = np.unique(found[number, mine, 1], return_index=True, return_inverse=True)
-            rows, radii = rows.astype(np.int32), np.zeros(len(rows))
-            np.maximum.at(radii, which.ravel(), BOUNDARY_REACH * spacings[mine])
+            rows = np.unique(found[number, owners == number, 1]).astype(np.int32)
             if number == self.peers.number:
                 self._sent = [known if k == number else rows for k, known in enumerate(self._sent)]
             else:
                 self._sides = np.concatenate([self._sides, np.full(len(rows), number)])
                 self._rows = np.concatenate([self._rows, rows])
-                self._caps = np.concatenate([self._caps, radii])
-                told.append(found[number, mine, 2:][first])
-        return np.concatenate(told)
 
     def _store(self) -> None:
         """Upload the lists of ghosts, and get their labels from their owners."""
-        engine, n, ways = self.stages.engine, len(self._chunks.spacings), len(self._shifts)
+        engine, n, ways = self.stages.engine, len(self._caps), len(self._shifts)
         order = np.argsort(self._sides, kind="stable")
         self._sides, self._rows = self._sides[order], self._rows[order]
-        self._caps[n:], self._limits[n:] = self._caps[n:][order], self._limits[n:][order]
-        places = np.concatenate([np.arange(n), n + np.argsort(order)])
-        assert self._answers is not None
-        self._answers = replace(self._answers, rows=places[self._answers.rows])
         parts, way = np.divmod(self._sides, ways)
         # This part is on the opposite side of the other part.
         sent = [np.concatenate(self._sent[k : k + ways][::-1]) for k in range(0, len(self._sent), ways)]
@@ -483,7 +450,7 @@ class PartSteps(DomainSteps):
 
     def _note(self, points: cla.Array) -> None:
         """Keep the positions of own generators, at which the limits hold, and upload the limits."""
-        engine, n = self.stages.engine, len(self._limits)
+        engine, n = self.stages.engine, len(self._caps)
         self._at = self._room("at", size=n * engine.dim).reshape(n, engine.dim)
         cl.enqueue_copy(engine.queue, buffer_of(self._at), buffer_of(points), byte_count=self._at.nbytes)
         # Single precision must not round limits up.
@@ -533,26 +500,26 @@ class PartSteps(DomainSteps):
 
     def _finished(self, part: Part, t: Tessellation | None) -> Tessellation | None:
         """Return the diagram of own cells; None if ghosts were missing, or if a part has no diagram `t`."""
-        engine, n = self.stages.engine, part.n_own
+        engine, n, convex = self.stages.engine, part.n_own, t
         attempt, sums = 0, FAILED
         if outside := self._n_outside:
             count = part.count - outside
             part = replace(part, count=count, points=part.points[:count], labels=part.labels[:count])
         while True:
-            cells = t
-            if t is not None and self._cut is not None:
-                cells = self._cut.finish_updated(t, part.points, part.count, attempt)
+            if convex is not None and self._cut is not None:
+                t = self._cut.finish_updated(convex, part.points, part.count, attempt)
             if part.ghosts is None:
-                return None if cells is None else replace(cells, part=part)
-            needed = engine.scratch(n if self._cut is None else part.count, np.float32)
-            if cells is not None:
+                return None if t is None else replace(t, part=part)
+            needed = engine.scratch(n, np.float32)
+            if t is not None:
                 assert self._at is not None
                 given = self._at, self._limits_there, 2 * (1 + NOISE[engine.real.name]), self._reads_rows, needed
-                slots = None if cells.trimmed is None else cells.trimmed.chords.slots
-                tried = 0 if self._cut is None else self._cut.attempt
-                sums = np.append(part.sums(engine, cells, *given, self._periods, slots), [0, tried])
+                attempt = 0 if self._cut is None else self._cut.attempt
+                sums = np.append(part.sums(engine, t, *given, self._periods), [0, attempt])
             sums = self.peers.total(sums)
-            if sums[5] or cells is None:
+            if sums[5] or t is None:
+                # Ghost generators outside may be too near to cells that this part does not know.
+                self._labels = self._labels if self._cut is None else None
                 return None
             if sums[3]:
                 if not self._ask_again(part, needed.get().astype(float)):
@@ -562,10 +529,10 @@ class PartSteps(DomainSteps):
             if not sums[6]:
                 break
             # All parts trace the boundary at the same place.
-            attempts = np.array(self.peers.gather(np.array(tried)))
-            if (attempts == (attempt := int(attempts.max()))).all():
+            attempts = np.array(self.peers.gather(np.array(attempt)))
+            attempt = int(attempts.max())
+            if (attempts == attempt).all():
                 break
-        t = cells
         if sums[4]:
             raise FewCellsError(
                 f"{int(sums[4])} neighbors of generators are half a period away or farther, expected at least four or "
@@ -602,16 +569,8 @@ class PartSteps(DomainSteps):
             )
 
     def _ask_again(self, part: Part, needed: np.ndarray) -> bool:
-        """Ask for the ghosts in balls of radii `needed` (k,) around the first k rows.
-
-        Return False if there are new ones.
-        """
-        n, x = part.n_own, part.points[: len(needed)].get().astype(float)
-        fresh = n + np.flatnonzero((needed[n:] > 0) & (self._caps[n : len(needed)] == 0))
-        if len(fresh):
-            # The boundary crosses further cells.
-            self._caps[fresh] = BOUNDARY_REACH * scipy.spatial.cKDTree(x).query(x[fresh], k=2)[0][:, 1]
-        needed = np.append(needed, np.zeros(len(self._caps) - len(needed)))
+        """Ask for the ghosts in balls of radii `needed` (n,). Return False if there are new ones."""
+        x = part.points[: part.n_own].get().astype(float)
         while True:
             # A cell without the ghosts around it may reach through the whole domain.
             radii = np.maximum(self._caps, np.minimum(GROWTH * needed, 2 * self._caps))
@@ -627,28 +586,24 @@ class PartSteps(DomainSteps):
 
     def _settle(self, answers: Answers, part: Part, needed: np.ndarray) -> None:
         """Divide the room around the balls that cells of `part` need, and set the limits of own generators."""
-        needed = np.append(needed, np.zeros(len(self._caps) - len(needed)))
-        told, self._answers = self.peers.exchange([answers.settle(needed[answers.rows])] * self.peers.count), None
+        told, self._answers = self.peers.exchange([answers.settle(needed)] * self.peers.count), None
         for side, facing in answers.facing.items():
             facing.facts[:, -2:] = told[side // len(self._shifts)]
-        self._limits[:] = 0
-        self._limits[answers.rows] = np.column_stack(self._limits_of(answers.balls, answers.facing))
+        self._limits = np.column_stack(self._limits_of(answers.balls, answers.facing))
         self._note(part.points)
 
     def _ask(self, x: np.ndarray, radii: np.ndarray, needed: np.ndarray) -> Answers:
-        """Ask for the generators in balls around own generators, and around some ghosts.
+        """Ask for the generators in balls around own generators.
 
         Parameters
         ----------
         x : (n, d) float
-            Positions of the first rows.
+            Positions of the generators.
         radii, needed : (n,) float
-            Radii of the balls to ask for, and of the balls that the present cells need; 0 for no ball.
+            Radii of the balls to ask for, and of the balls that the present cells need.
         """
         self.asked += 1
-        all_rows, n = np.flatnonzero(radii), len(self._chunks.spacings)
-        x, radii, needed = x[all_rows], radii[all_rows], needed[all_rows]
-        peers, balls, ways = self.peers, BallGroups(x, radii, self._chunks.joined(x[n:])), len(self._shifts)
+        peers, balls, ways = self.peers, BallGroups(x, radii, self._chunks), len(self._shifts)
         told, facing = peers.exchange([balls.facts] * peers.count), {}
         for side in range(len(self._sent)):
             number, way = divmod(side, ways)
@@ -669,7 +624,7 @@ class PartSteps(DomainSteps):
                 given[opposite] = rows
                 answers.append(np.column_stack([rows, inside(places, balls_there[:, :-1]), places + shift]))
             sent += self._joined(answers)
-        return Answers(all_rows, balls, np.unique(np.concatenate(asked)), facing, given, peers.exchange(sent))
+        return Answers(balls, np.unique(np.concatenate(asked)), facing, given, peers.exchange(sent))
 
     def _joined(self, tables: list[np.ndarray]) -> list[np.ndarray]:
         """Join the tables of all sides of each part to one array, whose last column is the number of the image."""
@@ -683,11 +638,10 @@ class PartSteps(DomainSteps):
         sides = [len(self._shifts) * number + rows[:, -1].astype(int) for number, rows in enumerate(answers.new)]
         rows = np.concatenate([rows[:, 0] for rows in answers.new]).astype(np.int32)
         self._sides, self._rows = np.concatenate([self._sides, *sides]), np.concatenate([self._rows, rows])
-        self._caps = np.append(self._caps, np.zeros(len(rows)))
         # All in the balls and their skins are known, while no generator moves.
         self._answers = replace(answers, new=[rows[:0] for rows in answers.new])
         self._limits, self._at = np.zeros((len(self._caps), 2)), None
-        self._limits[answers.rows, 0] = (1 + SKIN) * answers.balls.radii
+        self._limits[:, 0] = (1 + SKIN) * answers.balls.radii
         self._store()
 
     def _unknown(self, own: BallGroups, balls: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -703,7 +657,7 @@ class PartSteps(DomainSteps):
         lower = np.minimum.reduceat(balls[:, :dim] - balls[:, dim:], firsts, axis=0)
         groups = np.hstack([lower, np.maximum.reduceat(balls[:, :dim] + balls[:, dim:], firsts, axis=0)])
         near = (gaps(own.boxes, groups) <= 0).any(axis=1)[own.chunks.groups]
-        near[known] = near[len(self._chunks.spacings) :] = False
+        near[known] = False
         rows = np.flatnonzero(near)
         places = own.centers[rows]
         found = inside(places, balls)

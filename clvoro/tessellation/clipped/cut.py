@@ -23,6 +23,8 @@ PATIENCE = 3
 
 CLEARANCE = 3.0
 """Least distance to the boundary, in spacings of the generators there."""
+SAMPLED = 0.5
+"""Distance of places along the boundary whose nearest generators all parts know, over the spacing of generators."""
 GRADING = 1.5
 """Distance to the boundary over the spacing of ghost generators."""
 MOST_BOXES = 1 << 20
@@ -65,26 +67,24 @@ class Cut(DomainSteps):
         """The ghost generators in the device's coordinates, (g, 2)."""
         return self._ghosts
 
-    def landmarks(self) -> tuple[np.ndarray, np.ndarray]:
+    def landmarks(self) -> np.ndarray:
         """Return places (k, 2) along the boundary and all over the domain, in the device's coordinates.
 
-        All parts of a mesh know the generators nearest to them. Places along the boundary are half a cell apart; the
-        second array (k,) has the spacing of generators there, and 0 at the other places.
+        All parts of a mesh know the generators nearest to them: so each can trace the whole boundary. Far from its own
+        cells it traces cells that are nearly right, which is enough.
         """
         assert self._spacing is not None
         (origin, scale), edges = self._polygon.frame, self._polygon.oriented
         at, way = edges.vertices, edges.along
         for _ in range(2):
             h = np.asarray(self._spacing(at + way / 2), float)
-            counts = np.ceil(2 * np.hypot(*way.T) / h).clip(1).astype(int)
+            counts = np.ceil(np.hypot(*way.T) / (SAMPLED * h)).clip(1).astype(int)
             rows = np.repeat(np.arange(len(at)), counts)
             place = np.arange(len(rows)) - np.repeat(np.cumsum(counts) - counts, counts)
             way = way[rows] / counts[rows, None]
             at = at[rows] + place[:, None] * way
         inner = graded_places(self._polygon, self._spacing, inside=True)
-        h = np.asarray(self._spacing(at), float)
-        places = (np.concatenate([at, inner]) - origin) / scale
-        return places, np.concatenate([h / scale, np.zeros(len(inner))])
+        return (np.concatenate([at, inner]) - origin) / scale
 
     def extend(self, sites: cla.Array, n: int) -> Part:
         """Return the first `n` of `sites` with the ghost generators."""
