@@ -225,7 +225,7 @@ class Run:
         """Return how many parts work on a level: all of them on the finest one, fewer where there are few cells."""
         size = self._stages.engine.peers.size
         cells = self.target / 2.0 ** (self._domain.cell_dim * level)
-        return size if level == 0 else min(max(int(cells / PART_CELLS), 1), size)
+        return size if level == 0 else min(max(int(cells / PART_CELLS[self._domain.cell_dim]), 1), size)
 
     def call_parts(self, mesh: dict[str, Any]) -> None:
         """Call further parts to the next finer level, if it has work for them; `mesh` are arguments of its mesh."""

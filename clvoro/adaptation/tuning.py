@@ -34,8 +34,8 @@ RENEWAL = 10
 
 COARSEST = {2: 1400, 3: 1500}
 """Approximate number of cells of the coarsest level by dimension."""
-PART_CELLS = 50_000
-"""Least number of cells of a part on coarser levels: on levels of fewer cells not all parts work."""
+PART_CELLS = {2: 100_000, 3: 50_000}
+"""Least number of cells of a part on coarser levels, by dimension: on levels of fewer cells not all parts work."""
 CELLS_ACROSS = 5.0
 """Least number of cells between layers on coarser levels. Layers are as fine there as on the finest level."""
 STEP_CELLS = 3000

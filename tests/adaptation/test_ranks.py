@@ -225,7 +225,7 @@ def test_a_run_in_parts(ctx, kind, tmp_path, monkeypatch):
     few = clvoro.MultilevelOptions(levels=1 if kind == "sphere" else 2)
     wells = [(0.25, 0.25)] if kind == "polygon" else None
     alone = clvoro.Adapter(ctx).run(*given, effort="fast", options=few, fixed=wells)
-    monkeypatch.setattr(run, "PART_CELLS", len(alone) / 2**domain.cell_dim / 2.5)
+    monkeypatch.setitem(run.PART_CELLS, domain.cell_dim, len(alone) / 2**domain.cell_dim / 2.5)
     meshes, whole = run_in(3, ctx, *given, effort="fast", options=few, fixed=wells, path=tmp_path)
     assert whole.check()
     assert wells is None or np.array_equal(whole.points[0], wells[0])
