@@ -45,6 +45,7 @@ _SAMPLES = 8  # of 1 / h per step, at least
 _FEWEST = 64  # samples per chain, at least
 _MOST = 1 << 16
 _ROUNDS = 3  # of reflections at a corner
+_NEARBY = 4.0  # over h: chains whose crowded chords are further apart do not take room from each other
 _EXACT = 0.02  # of a radius: generators this near to a sphere are on it
 _CROWD = 16  # generators at a corner, about
 _ITERATIONS = 8  # of Newton's method
@@ -112,24 +113,40 @@ def place_stations(solid: Solid, size: Callable[[np.ndarray], np.ndarray]) -> St
     chains = [chain for chain in chains if len(chain.h)]
     while True:
         placing = _placed(solid, chains)
-        crowded = np.split(placing.without_room(), np.cumsum([len(chain.h) for chain in chains]))[:-1]
+        ends = np.cumsum([len(chain.h) for chain in chains])
+        crowded, spots = (np.split(values, ends)[:-1] for values in (placing.without_room(), placing.spots))
         if any([chain.shrink(where) for chain, where in zip(chains, crowded, strict=True)]):
             continue
         left = [k for k, where in enumerate(crowded) if where.any()]
         if not left:
             break
-        shortest = min(left, key=lambda k: len(chains[k].h))
-        chains[shortest].leave_out(crowded[shortest])
+        for k in _shortest_nearby(chains, left, [spots[k][crowded[k]] for k in left]):
+            chains[k].leave_out(crowded[k])
     placing.complete(solid)
     return placing.stations()
+
+
+def _shortest_nearby(chains: Sequence[_Crease], crowded: list[int], spots: list[np.ndarray]) -> list[int]:
+    """Return those of the chains `crowded` that have fewer chords than all others around their crowded `spots`.
+
+    What is left out there makes room for others, but not further away.
+    """
+    chain = np.repeat(crowded, [len(x) for x in spots])
+    reach = _NEARBY * np.concatenate([np.full(len(x), chains[k].h.max()) for k, x in zip(crowded, spots, strict=True)])
+    points = np.concatenate(spots)
+    i, j = scipy.spatial.KDTree(points).query_pairs(reach.max(), output_type="ndarray").T
+    near = np.linalg.norm(points[i] - points[j], axis=1) < np.maximum(reach[i], reach[j])
+    i, j = chain[i[near]], chain[j[near]]
+    rank = np.array([len(chain.h) for chain in chains]) * len(chains) + np.arange(len(chains))
+    later = np.where(rank[i] > rank[j], i, j)
+    return np.setdiff1d(crowded, later[i != j]).tolist()
 
 
 def _placed(solid: Solid, chains: Sequence[_Crease]) -> AroundCreases:
     """Return the generators around `chains`, with one where those of two chains meet."""
     share_corners(chains)
     placing = AroundCreases(lambda x: -solid.signed_distance(x))
-    for chain in chains:
-        placing.add(chain)
+    placing.add(chains)
     placing.join()
     return placing
 
@@ -146,6 +163,8 @@ class ChainOfChords:
         Of each chord: size of the cells, and length along the chain up to its middle.
     lengths, ways : (n,) and (n, 3) float
         Of each chord: length, and unit vector.
+    spots : (n, 3) float
+        The places on the chain at `middle`.
     nodes, radii : (n + 1, 3) and (n + 1,) float
         The ends of the chords, and the distances of the generators from them.
     turns : list of (k,) float
@@ -168,7 +187,7 @@ class ChainOfChords:
     ) -> None:
         self.number, self.line, self.vertices = number, line, vertices
         at, self.middle, self.h = _divide(self.line, size, ends, shortest)
-        self.nodes = self.line.along(self.line.points, at)
+        self.nodes, self.spots = (self.line.along(self.line.points, s) for s in (at, self.middle))
         chords = np.diff(self.nodes, axis=0)
         self.lengths = np.linalg.norm(chords, axis=1)
         self.ways = chords / self.lengths[:, None]
@@ -326,18 +345,24 @@ class AroundCreases:
         """The middle of each chord without generators, (k, 3)."""
         return self.spots[~self._chords_of(np.ones(len(self.points), bool))]
 
-    def add(self, chain: ChainOfChords) -> None:
-        """Add the generators and balls of a chain."""
-        first, chord = len(self.centers), np.repeat(np.arange(len(chain.h)), chain.count)
-        self.centers += list(chain.nodes)
-        self.radii += chain.radii.tolist()
-        self.points = np.vstack([self.points, *(chain.around(i) for i in range(len(chain.h)))])
-        self.sizes = np.append(self.sizes, chain.h[chord])
-        self.sized = np.append(self.sized, chain.sized[chord])
-        self.chains = np.append(self.chains, np.full(len(chord), chain.number))
-        self.chords += [[len(self.spots) + i] for i in chord.tolist()]
-        self.spots = np.vstack([self.spots, chain.line.along(chain.line.points, chain.middle)])
-        self.balls += [[first + i, first + i + 1] for i in chord.tolist()]
+    def add(self, chains: Sequence[ChainOfChords]) -> None:
+        """Add the generators and balls of chains."""
+        points, sizes, sized, numbers, spots = [self.points], [self.sizes], [self.sized], [self.chains], [self.spots]
+        spot = len(self.spots)
+        for chain in chains:
+            first, chord = len(self.centers), np.repeat(np.arange(len(chain.h)), chain.count)
+            self.centers += list(chain.nodes)
+            self.radii += chain.radii.tolist()
+            points += [chain.around(i) for i in range(len(chain.h))]
+            sizes.append(chain.h[chord])
+            sized.append(chain.sized[chord])
+            numbers.append(np.full(len(chord), chain.number))
+            spots.append(chain.spots)
+            self.chords += [[spot + i] for i in chord.tolist()]
+            self.balls += [[first + i, first + i + 1] for i in chord.tolist()]
+            spot += len(chain.h)
+        self.points, self.spots = np.vstack(points), np.vstack(spots)
+        self.sizes, self.sized, self.chains = map(np.concatenate, (sizes, sized, numbers))
 
     def keep(self, kept: np.ndarray) -> None:
         """Keep the generators `kept`, (k,) int or (n,) bool."""

@@ -173,8 +173,7 @@ def _place_around_edges(sheets: Sheets, domain: Domain, size: Callable[[np.ndarr
             chains.append(fold)
     share_corners(chains)
     placing = AroundCreases(depth)
-    for chain in chains:
-        placing.add(chain)
+    placing.add(chains)
     placing.join(_JOINED)
     placing.fit()
     placing.leave_out()
