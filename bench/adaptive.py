@@ -1,7 +1,7 @@
 """Meshes that follow a function: interpolation error against the isotropic optimum, beside Gmsh and MMG.
 
     python bench/adaptive.py [--spaces plane,space,sphere] [--functions smooth,layer,kink,shock] [--cells 4000]
-                             [--cycles 4] [--growth 2] [--effort fast] [--norms 1,2] [--peers ""]
+                             [--cycles 6] [--growth 2] [--effort fast] [--norms 1,2] [--peers ""]
                              [--pictures FOLDER] [--device NAME] [--json]
 
 Each mesh begins uniform. A cycle evaluates the function at the centroids of the cells, takes sizes from
@@ -386,7 +386,7 @@ def main(arguments: list[str] | None = None) -> int:
     made.add_argument("--spaces", default=",".join(SPACES))
     made.add_argument("--functions", default=",".join(FUNCTIONS))
     made.add_argument("--cells", type=int, default=4000)
-    made.add_argument("--cycles", type=int, default=4)
+    made.add_argument("--cycles", type=int, default=6)
     made.add_argument("--growth", type=float, default=2.0)
     made.add_argument("--effort", default="fast", choices=("fast", "default", "best"))
     made.add_argument("--norms", default="1,2")
