@@ -189,8 +189,12 @@ def layer_mismatches(layers: LayerRows | LayerPrisms | None, field: Field) -> li
     """
     if layers is None:
         return []
-    mismatch = _row_mismatch if isinstance(layers, LayerRows) else _prism_mismatch
-    return [text for k in range(len(layers.layers)) if (text := mismatch(layers, k, field))]
+    count = range(len(layers.layers))
+    if isinstance(layers, LayerRows):
+        found = [_row_mismatch(layers, k, field) for k in count]
+    else:
+        found = [_prism_mismatch(layers, k, field) for k in count]
+    return [text for text in found if text]
 
 
 def _row_mismatch(rows: LayerRows, k: int, field: Field) -> str:
