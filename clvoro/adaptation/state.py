@@ -350,25 +350,30 @@ class MeshState:
         """Return the target size at `points` (k, d) on this level, (k,)."""
         return self.size_factor * np.asarray(self.sizing(points))
 
-    def set_generators(self, rows: dict[str, cla.Array], first: bool = False) -> None:
+    def set_generators(self, rows: dict[str, cla.Array], first: bool = False, inserted: int = 0) -> None:
         """Replace the generators, sort them by bin for locality in memory, and update the mesh.
 
         Parameters
         ----------
         rows : dict of device arrays
             The fields of `Generators`, removed from the dict. Memory is freed only if there is no other reference.
+        first : bool
+            There are no earlier ones.
+        inserted : int
+            How many of them are new.
         """
         stages, peers = self.stages, self.engine.peers
         if peers.count > 1 and (first or not is_balanced(len(rows["points"]), peers)):
             rows = distribute(self.engine, self.domain, rows)
         n = len(rows["points"])
-        self.total = int(peers.total(n))
+        total = int(peers.total(n))
         binned = stages.bins.build(self.domain, rows["points"], n)
         stages.bins.clear_work()
         items = binned.items[:n].copy()
         # One array after the other, so that each is freed when it has been sorted.
         new = {name: stages.gather.rows(items, rows.pop(name)) for name in list(rows)}
-        self._data = Arrays(Generators(**new))
+        # One assignment, because an interruption between two would leave numbers that are not those of the generators.
+        self._data, self.total, self.next_label = Arrays(Generators(**new)), total, self.next_label + inserted
         del new, items
         stages.bins.renumber(binned, n)
         self.update(first, binned)
@@ -608,8 +613,7 @@ class MeshState:
         self.engine.workspace.shrink()
         self.stages.insertion_deletion.clear()
         if rows:
-            self.next_label += counts[0]
-            self.set_generators(rows)
+            self.set_generators(rows, inserted=counts[0])
         return counts
 
     def open_triangles(self) -> tuple[int, bool]:
