@@ -176,7 +176,9 @@ def replace_far(
         slope = slopes[mine] * coverage.relative_edges(mine)
         return coverage.draw(_log_linear(rng.random((len(wanted), domain.dim)), slope), mine, attempt)
 
-    return _in_all_pieces(domain, _distinct(draw, domain, points[rows], len(box), np.dtype(real))), rows
+    found = _distinct(draw, domain, points[rows], len(box), np.dtype(real))
+    # The caller's points may be fewer than the pieces: later insertions reach the others.
+    return _in_all_pieces(domain, found) if len(found) >= domain.n_pieces or not len(rows) else found, rows
 
 
 def _are_far(expected: np.ndarray, given: np.ndarray, dim: int) -> np.ndarray:
