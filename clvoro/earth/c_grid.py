@@ -113,7 +113,7 @@ def measure_c_grid(diagram: Diagram) -> CGridMeasures:
     after = d.half_faces.next
     before = np.argsort(after)
     corners = np.flatnonzero(inner & inner[before])
-    begin = d.vertices[d.half_faces.ends[:, 0]]
+    begin, end = d.vertices[d.half_faces.ends.T]
     own, line = d.points[owner], np.zeros_like(begin)
     line[inner] = d.half_faces.behind(np.flatnonzero(inner)) - own[inner]
     distance = np.maximum(np.linalg.norm(line, axis=1), 1e-300)
@@ -136,20 +136,20 @@ def measure_c_grid(diagram: Diagram) -> CGridMeasures:
         np.where(inner, d.face_measures / distance, 0.0),
         away / np.sqrt(d.volumes),
         ratio,
-        _off_bisector(d, own, line),
+        off_bisector(begin - own, end - own, line) if domain.cuts_cells else np.zeros(len(line)),
         inner,
         *_cells_around(d, corners, after),
     )
 
 
-def _off_bisector(d: Diagram, own: np.ndarray, line: np.ndarray) -> np.ndarray:
-    """Return how far edges are from the bisectors of their generators; see `CGridMeasures`."""
-    if not d.domain.cuts_cells:
-        return np.zeros(len(line))
-    ends = d.vertices[d.half_faces.ends] - own[:, None]
+def off_bisector(begin: np.ndarray, end: np.ndarray, line: np.ndarray) -> np.ndarray:
+    """Return how far edges are from the bisectors of their generators (k,); see `CGridMeasures`.
+
+    `begin`, `end` and the other generator, `line`, are relative to one generator; `line` is 0 on walls.
+    """
     square = np.maximum((line**2).sum(axis=1), 1e-300)
-    shares = (ends * line[:, None]).sum(axis=2) / square[:, None]
-    return np.where(line.any(axis=1), np.abs(shares - 0.5).max(axis=1), 0.0)
+    shares = [(x * line).sum(axis=1) / square for x in (begin, end)]
+    return np.where(line.any(axis=1), np.abs(np.subtract(shares, 0.5)).max(axis=0), 0.0)
 
 
 def _angles(vertex: np.ndarray, middle: np.ndarray, normal: np.ndarray, distance: np.ndarray) -> np.ndarray:

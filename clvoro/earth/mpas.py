@@ -20,8 +20,10 @@ from ..geometry.sphere import Sphere, triangle_areas
 from ..io.contents import Contents
 from ..io.netcdf import NetCDF, squared
 from ..mesh.diagram import Diagram
+from ..mesh.faces import OFF_BISECTOR
 from ..mesh.half_faces import HalfEdges
 from ..mesh.straightening import cross
+from .c_grid import off_bisector
 from .criteria import coast_faults
 from .trisk import find_weights
 
@@ -130,7 +132,8 @@ def _in_plane(diagram: Diagram, halves: HalfEdges) -> Shape:
     """Return lengths and areas in the plane.
 
     An edge on a wall is at its middle, and its distance of generators is sqrt(3) times its length, as in the tools of
-    MPAS. Behind an edge towards a removed cell is the generator of that one.
+    MPAS. Behind an edge towards a removed cell is the generator of that one, unless the edge is off their bisector,
+    because a wall has cut the removed cell: then it is as on a wall.
     """
     own, first = diagram.points[halves.cell], halves.first
     # Relative to the generators of the cells.
@@ -139,6 +142,7 @@ def _in_plane(diagram: Diagram, halves: HalfEdges) -> Shape:
     inner = (behind >= 0) | diagram.domain.removed_behind(-1 - behind)
     line, middle = np.zeros_like(own), (begin + end) / 2
     line[inner] = diagram.half_faces.behind(halves.rows[inner]) - own[inner]
+    inner &= off_bisector(begin, end, line) <= OFF_BISECTOR
     lengths = diagram.face_measures[halves.rows[first]]
     distances = np.where(inner[first], np.hypot(*line[first].T), np.sqrt(3) * lengths)
     foot = np.where(inner[:, None], line / 2, middle)
