@@ -160,7 +160,7 @@ def run(folder, text, *options):
     ("run_table", "options", "warned"),
     [
         ('method = "lloyd"\neffort = "fast"\nlevels = 1', [], ["effort", "levels"]),
-        ("k = 0.7\nalpha = 1", [], ["k", "alpha"]),
+        ("k = 0.7\nalpha = 1", [], ["alpha", "k"]),
         ('methods = ["lloyd", "weighted"]\nerror_target = 0.1', [], ["error_target"]),
         ("", ["--method", "lloyd", "--effort", "fast", "--levels", "3"], ["effort", "levels"]),
         # One of the methods uses each.

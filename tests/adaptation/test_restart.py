@@ -13,9 +13,9 @@ FITTED = {n: n_steps(adaptive_schedule(2, "default", 0, False, begins="mesh", mo
 SHORT = {dim: len(adaptive_schedule(dim, "default", 0, False, begins="near")) for dim in (2, 3)}
 
 
-def field(dim, moved=0.0, factor=1.0):
+def field(dim, moved=0.0, factor=1.0, h_min=0.01):
     if dim == 2:
-        return sizing.Distance(sizing.Circle((0.4 + moved, 0.4), 0.2), h_min=0.01, slope=0.1) * factor
+        return sizing.Distance(sizing.Circle((0.4 + moved, 0.4), 0.2), h_min=h_min, slope=0.1) * factor
     return sizing.Distance(sizing.Ball((0.4 + moved, 0.4, 0.35), 0.2), h_min=0.05, slope=0.15) * factor
 
 
@@ -57,15 +57,17 @@ def test_moved_by_two_cells(adapter, first, dim):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("method", ["adaptive", "exact"])
-def test_moved_again_and_again(adapter, first, method):
-    points = first[2].points
+def test_moved_again_and_again(adapter, method):
+    """With 3500 cells: those of `first` are too few for shapes to recover from moves by two cells that follow."""
+    begin = adapter.run(BOXES[2], field(2, h_min=0.006), seed=4)
+    points = begin.points
     for k in range(1, 5):
-        result = adapter.run(BOXES[2], field(2, 0.02 * k), points=points, method=method)
+        result = adapter.run(BOXES[2], field(2, 0.012 * k, h_min=0.006), points=points, method=method)
         points = result.points
         assert steps_to_tolerance(result.history) <= 5
     # The exact projection alone costs about 0.002 (compare default and exact in bench/convergence.py).
     lost = 0.004 if method == "adaptive" else 0.006
-    assert result.quality.mean() > first[2].quality.mean() - lost
+    assert result.quality.mean() > begin.quality.mean() - lost
     if method == "exact":
         assert np.abs(result.size_error).max() < 0.002
 

@@ -7,6 +7,7 @@ import pytest
 
 import clvoro
 from clvoro import sizing
+from clvoro.adaptation.diagnostics import MISSED
 from clvoro.adaptation.plan.actions import count_changed
 from clvoro.adaptation.plan.efforts import EFFORTS_3D
 from tests.reference import runs
@@ -148,7 +149,7 @@ def test_fields(adapter, name):
     field = FIELDS[name]()
     result = adapter.run(BOX, field, effort="fast", seed=20)
     check(result, field)
-    assert result.converged
+    assert result.converged == (np.abs(result.size_error).mean() <= MISSED)
     if "domain" in name:
         assert len(result.points) == 1
     elif name not in INFEASIBLE:

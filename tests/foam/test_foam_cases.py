@@ -632,5 +632,6 @@ def test_boxes_follow(tmp_path, box, known):
     assert made.volumes.sum() == pytest.approx(1)
     after = foam.read_field(folder / "1" / "T").internal.rows(made.n_cells)[:, 0]
     assert made.volumes @ after == pytest.approx(before.volumes @ values, abs=1e-12)
-    assert after == pytest.approx(np.tanh(10 * (made.centroids[:, 1] - 0.5)), abs=0.35)
+    # Each old cell's value without a gradient would give 0.09 in space. Single cells are off by half a jump.
+    assert made.volumes @ np.abs(after - np.tanh(10 * (made.centroids[:, 1] - 0.5))) < 0.05
     assert [patch.kind for patch in made.patches] == [patch.kind for patch in before.patches]
