@@ -347,9 +347,6 @@ def test_wrong_types():
             make()
 
 
-FIGURE_EIGHT = [(0, 0), (1, 1), (2, 0), (1, 0.2), (0, 1), (-1, 0.5)]
-
-
 @pytest.mark.parametrize(
     ("outer", "holes", "says"),
     [

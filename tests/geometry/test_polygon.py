@@ -182,7 +182,6 @@ def test_frame_and_clip_box() -> None:
     assert domain.dim == 2
 
 
-SQUARE_HOLES = lambda *holes: lambda: clvoro.Polygon(SQUARE, holes)  # noqa: E731
 ONE = lambda *ring: lambda: clvoro.Polygon(ring)  # noqa: E731
 PIECES = lambda *rings: lambda: clvoro.Polygon.from_pieces([[r] for r in rings])  # noqa: E731
 
