@@ -5,10 +5,11 @@ reach of a cell is the distance of its farthest corner from its generator. The b
 radius contains the balls of all corners. So a cell is final if this part knows all generators in that ball.
 
 Each part tells the others the boxes around its generators, and asks those whose boxes meet its balls for the generators
-inside. It asks for balls that are larger than necessary. So the ghosts are enough for some steps. The parts ask again
-only when a ball has become larger than the one of the last request, or when a generator has moved so far that it may be
-in a ball of a part that does not know it (`sum_cells` in part.cl). If there are new ghosts, all parts make their cells
-again.
+inside. It asks for balls that are larger than necessary. So the ghosts are enough for some steps. When the cells are
+known, the room beyond the balls that they need is divided: balls become larger by a share of it, and the rest is a skin
+in which there is no unknown generator. The parts ask again only when a cell needs a larger ball, or when a generator
+has moved so far that it may be in a ball of a part that does not know it (`sum_cells` in part.cl). If there are new
+ghosts, all parts make their cells again.
 """
 
 from __future__ import annotations
@@ -39,10 +40,9 @@ from .polyhedra import Polyhedra
 from .stages import TessellationStages
 from .steps import DomainSteps, Sort
 
-FIRST_REACH = {(3, 3): 2.5, (2, 2): 3.3, (3, 2): 3.0}
-"""Radius of the first balls over the spacing of the generators around, by the dimensions of space and cells. Where
-cells have two, those of neighboring ghosts must be final, too. On a sphere the spacing is overestimated: bins are cubes
-in space."""
+FIRST_REACH = {2: 3.3, 3: 2.5}
+"""Radius of the first balls over the spacing of the generators around, by the dimension of cells. Where cells have two,
+those of neighboring ghosts must be final, too."""
 LAST_LABEL = 2**31 - 1
 """Label of the first ghost generator outside of a polygon; the others have those before it."""
 RUN, AHEAD = 32, 4
@@ -64,9 +64,6 @@ NOISE = {"float64": 1e-6, "float32": 1e-4}
 FILLED, MATCHED = {"float64": 1e-8, "float32": 1e-3}, {"float64": 1e-5, "float32": 1e-3}
 """`FILLED`: largest relative difference between the volume of all cells and that of the domain. `MATCHED`: largest
 relative difference between the measures of faces between parts, seen from both sides."""
-MOST_GHOSTS = 1.0
-"""In 3D cells are built anew, and not updated, if there are more ghosts than this share of the own generators: too many
-cells are beside ghosts."""
 GROUP = 64
 """Number of balls in each group of the balls that another part has sent."""
 FAILED = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0])
@@ -409,7 +406,7 @@ class PartSteps(DomainSteps):
         self._sent = [np.empty(0, np.int32) for _ in range(self.peers.count * len(self._shifts))]
         self._sides, self._rows = np.empty(0, int), np.empty(0, np.int32)
         self._share_landmarks(x)
-        self._caps = FIRST_REACH[self.domain.dim, self.domain.cell_dim] * self._chunks.spacings
+        self._caps = FIRST_REACH[self.domain.cell_dim] * self._chunks.spacings
         self._take(self._ask(x, self._caps, self._caps))
 
     def _share_landmarks(self, x: np.ndarray) -> None:
@@ -481,9 +478,7 @@ class PartSteps(DomainSteps):
             binned = stages.bins.build(self.box, part.points, part.count)
             cells.clip_rest(cut, report, part, binned, before)
 
-        t = None
-        if self._reads_rows or part.count - n <= MOST_GHOSTS * n:
-            t = stages.update.update(stages.cells, self.box, part.points, before, clip=clip)
+        t = stages.update.update(stages.cells, self.box, part.points, before, clip=clip)
         if t is not None:
             part.order_rows(stages.engine, t, stages.cells.defines)
         else:

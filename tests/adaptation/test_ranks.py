@@ -37,8 +37,7 @@ from clvoro.opencl import memory_limits
 from clvoro.opencl.engine import Engine
 from clvoro.opencl.peers import Peers
 from clvoro.opencl.threads import Team
-from clvoro.tessellation import part_steps
-from clvoro.tessellation.part_steps import PartSteps
+from clvoro.tessellation.stages import UPDATES
 
 ARRAYS = (
     *("points", "volumes", "centroids", "neighbor_starts", "neighbors", "face_measures", "face_centroids"),
@@ -163,15 +162,15 @@ def test_the_diagram_has_the_same_bits_in_any_number_of_parts(ctx, dim, dtype, k
 @pytest.mark.parametrize("kind", ["plane", "space", "polygon"])
 def test_steps_have_the_same_bits_in_any_number_of_parts(ctx, kind, monkeypatch):
     """Generators move by Lloyd's algorithm, in boxes across a seam. Cells are made anew at first, and updated later."""
-    updated, update, dim = [], PartSteps.update, 3 if kind == "space" else 2
+    dim = 3 if kind == "space" else 2
+    updated, update = [], UPDATES[dim].update
 
-    def noted(steps, *given):
-        found = update(steps, *given)
-        updated.append((steps.peers.count, found is not None))
+    def noted(stage, *given, **more):
+        found = update(stage, *given, **more)
+        updated.append((stage.engine.peers.count, found is not None))
         return found
 
-    monkeypatch.setattr(PartSteps, "update", noted)
-    monkeypatch.setattr(part_steps, "MOST_GHOSTS", 2)
+    monkeypatch.setattr(UPDATES[dim], "update", noted)
     box = clvoro.Box((0,) * dim, (6, *[1] * (dim - 1)), periodic=(True, *[False] * (dim - 1)))
     x = np.random.default_rng(70102).random((800, dim)) * box.extent
     if kind == "polygon":
