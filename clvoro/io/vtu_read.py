@@ -30,6 +30,7 @@ from ..mesh.check.rebuilt import rebuild, rebuild_on_sphere
 from ..mesh.connectivity import following
 from ..mesh.diagram import Diagram
 from ..mesh.results import Result, result_of_file
+from ..mesh.straightening import cell_quality
 from .arrays import EXPANSION, LEAST, FileError, explained
 from .contents import described
 from .vtu import DOMAIN, KINDS, SOLVER_MESH
@@ -202,7 +203,8 @@ def load_vtu(path: str | PathLike[str]) -> Result | Diagram:
 def load_pvtu(path: str | PathLike[str], tessellate: Callable[[Domain, np.ndarray], Diagram]) -> Result | Diagram:
     """Read the mesh of all ranks from a `.pvtu` file of `Result.save` and its pieces, rank by rank.
 
-    Generators, sizes, errors and quality are those of the pieces. `tessellate` makes the cells again, since walls bound
+    Generators, sizes and errors are those of the pieces, and so is the quality, but for polygons: where cells meet in a
+    concave corner, round-off decides which ones share a face. `tessellate` makes the cells again, since walls bound
     those of a piece. The mesh of a single process is its piece.
     """
     with explained(path, "a .pvtu file that save wrote"):
@@ -216,14 +218,16 @@ def load_pvtu(path: str | PathLike[str], tessellate: Callable[[Domain, np.ndarra
         if len(pieces) == 1:
             return pieces[0]
         results = [piece for piece in pieces if isinstance(piece, Result)]
-        points, volumes, *fields = (
+        points, volumes, sizes, errors, quality = (
             np.concatenate([getattr(piece, name) for piece in results])
             for name in ("points", "volumes", "target_size", "size_error", "quality")
         )
         diagram = tessellate(described(json.loads(said[1])), points)
         if not np.allclose(diagram.volumes, volumes, rtol=_SAME_VOLUME):
             raise FileError("its pieces are not those of one mesh; save it again")
-        return result_of_file(diagram, *fields, ".pvtu")
+        if diagram.domain.cuts_cells:
+            quality = cell_quality(diagram, np.empty(0))
+        return result_of_file(diagram, sizes, errors, quality, ".pvtu")
 
 
 def cell_data_of_vtu(path: str | PathLike[str]) -> dict[str, np.ndarray] | None:
