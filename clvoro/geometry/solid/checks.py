@@ -212,8 +212,9 @@ def _caps(surface: Surface) -> list[np.ndarray]:
     """
     caps = []
     rings = [ring for ring in _rings(surface.open_edges) if len(ring) > 2]
-    planes = [_plane(surface.vertices[ring]) for ring in rings]
-    left = [k for k, plane in enumerate(planes) if plane is not None]
+    fits = enumerate(_plane(surface.vertices[ring]) for ring in rings)
+    planes = {k: plane for k, plane in fits if plane is not None}
+    left = list(planes)
     while left:
         center, axes, tolerance = planes[left[0]]
         flat = {k: (surface.vertices[rings[k]] - center) @ axes.T for k in left}
