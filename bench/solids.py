@@ -1,7 +1,8 @@
 """Meshes of solids, and what OpenFOAM says: `checkMesh -allGeometry -allTopology` for CAD-like parts.
 
     python bench/solids.py [--only NAMES] [--runs NAMES] [--seeds N] [--resolutions NUMBERS] [--booleans N]
-                           [--first N] [--cells N] [--limit SECONDS] [--speed NUMBERS] [--domains NAMES] [--order SIZES]
+                           [--files FOLDER] [--first N] [--cells N] [--limit SECONDS] [--speed NUMBERS]
+                           [--domains NAMES] [--order SIZES]
                            [--layers THICKNESS:COUNT:GROWTH,...] [--surfaces] [--keep FOLDER]
                            [--pictures FOLDER] [--device NAME] [--dtype float32] [--json]
 
@@ -20,6 +21,9 @@ With `--booleans N` the solids are N random booleans of boxes, balls and cylinde
 whose numbers `--only` lists, with about `--cells` cells each, in a process that may crash or hang. Each is accepted,
 rejected, refused (by a message, before there is a mesh), or it fails: an exception, a crash, no end within the limit, a
 cell that is not closed, or walls that are off by more than 0.1 h in the mean. Seconds and the limit are processor time.
+`--files FOLDER` does the same for all STL and OBJ files below a folder, as `*.stl.gz` too: for the inside of each
+surface, and for the air around it with sizes of h / 2 to 2 h. Surfaces are repaired. Debian's package openfoam-examples
+has many in /usr/share/doc/openfoam-examples.
 With `--layers` all patches of the solids have layers of prisms, such as `0.5:5:1.3`: 0.5 h thick, five layers, growth
 1.3. A row has the inner cells and the prisms, the mean thickness over the one given at the vertices of walls, the
 share of these with at least 0.9 of it, the mean first height where it is at least 0.9 of the one given, and the
@@ -32,6 +36,7 @@ Pictures show each mesh cut open, with the patches or the regions in colors.
 from __future__ import annotations
 
 import argparse
+import gzip
 import math
 import multiprocessing
 import resource
@@ -91,10 +96,10 @@ def quotient(diagram: clvoro.Diagram) -> float:
     return float((36 * np.pi * diagram.volumes**2 / area**3).mean())
 
 
-def measure(adapter: clvoro.Adapter, solid: clvoro.Solid, h: float, case: Path, **settings: Any) -> dict[str, Any]:
+def measure(adapter: clvoro.Adapter, solid: clvoro.Solid, size: Any, case: Path, **settings: Any) -> dict[str, Any]:
     """Adapt, write and check a mesh; return its figures."""
     begin = time.perf_counter()
-    result = adapter.run(solid, h, **settings)
+    result = adapter.run(solid, size, **settings)
     seconds = time.perf_counter() - begin
     result.to_openfoam(case / "constant" / "polyMesh", check=False)
     verdict = check_case(case)
@@ -133,15 +138,39 @@ _OFF = 0.1
 """Largest mean distance of the walls from the surface, over h; a chord of a curved wall is nearer."""
 
 
-def measure_boolean(adapter: clvoro.Adapter, number: int, cells: int) -> dict[str, Any]:
-    """Mesh a random solid, and return its figures with a verdict."""
-    try:
-        solid = solid_of(random_part(number))
+def part_of(job: int | tuple[Path, bool], cells: int) -> tuple[clvoro.Solid, float, Any]:
+    """Return a random solid by its number, or the inside or outside of a file's surface, with h and the size field."""
+    if isinstance(job, int):
+        solid = solid_of(random_part(job))
         h = (solid.measure / cells) ** (1 / 3)
+        return solid, h, h
+    path, outside = job
+    with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        if path.suffix == ".gz":
+            copy = Path(folder) / path.stem
+            copy.write_bytes(gzip.decompress(path.read_bytes()))
+            path = copy
+        solid = clvoro.Solid.read(path, repair=True, name=job[0].name)
+    if not outside:
+        h = (solid.measure / cells) ** (1 / 3)
+        return solid, h, h
+    lower, upper = np.array(solid.lower), np.array(solid.upper)
+    room = 0.6 * (upper - lower).max()
+    air = clvoro.Solid.outside(solid, (lower - room, upper + room))
+    h = (air.measure / cells) ** (1 / 3)
+    body = [air.boundary(name) for name in set(air.boundary_names) & set(solid.boundary_names)]
+    return air, h, clvoro.sizing.Distance(body, h_min=0.5 * h, growth=1.2, h_max=2 * h)
+
+
+def measure_boolean(adapter: clvoro.Adapter, job: int | tuple[Path, bool], cells: int) -> dict[str, Any]:
+    """Mesh a random solid or that of a file, and return its figures with a verdict."""
+    begin = time.process_time()
+    try:
+        solid, h, size = part_of(job, cells)
         with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
-            begin = time.process_time()
-            row = measure(adapter, solid, h, Path(folder))
+            row = measure(adapter, solid, size, Path(folder))
             row["seconds"] = time.process_time() - begin
     except ClvoroError as error:
         return {"verdict": "refused", "complaints": str(error)}
@@ -165,26 +194,34 @@ def measure_boolean(adapter: clvoro.Adapter, number: int, cells: int) -> dict[st
     return row
 
 
-def _serve(numbers: Any, options: argparse.Namespace) -> None:
-    """Measure the random solids whose numbers come through a pipe, in a process of its own."""
+def _serve(jobs: Any, options: argparse.Namespace) -> None:
+    """Measure the solids that come through a pipe, in a process of its own."""
     adapter = make_adapter(options)
     while True:
-        number, used = numbers.recv(), resource.getrusage(resource.RUSAGE_SELF)
+        job, used = jobs.recv(), resource.getrusage(resource.RUSAGE_SELF)
         resource.setrlimit(resource.RLIMIT_CPU, (math.ceil(used.ru_utime + used.ru_stime + options.limit), -1))
-        numbers.send(measure_boolean(adapter, number, options.cells))
+        jobs.send(measure_boolean(adapter, job, options.cells))
 
 
 def measure_booleans(options: argparse.Namespace, report: Report) -> str:
-    """Add a row for each random solid, and return how many have each verdict."""
+    """Add a row for each random solid or file, and return how many have each verdict."""
     context, worker, pipe = multiprocessing.get_context("spawn"), None, None
-    for number in counts(options.only) or range(options.first, options.first + options.booleans):
+    jobs: dict[Any, Any] = {
+        number: number for number in counts(options.only) or range(options.first, options.first + options.booleans)
+    }
+    if options.files:
+        found = sorted(
+            p for p in options.files.rglob("*") if p.name.lower().removesuffix(".gz").endswith((".stl", ".obj"))
+        )
+        jobs = {f"{p.name}, {what}": (p, what == "outside") for p in found for what in ("inside", "outside")}
+    for number, job in jobs.items():
         if worker is None or pipe is None:
             pipe, end = context.Pipe()
             worker = context.Process(target=_serve, args=(end, options), daemon=True)
             worker.start()
             end.close()
         row: dict[str, Any] = {"solid": number, "cells": 0, **dict.fromkeys(_EMPTY, float("nan"))}
-        pipe.send(number)
+        pipe.send(job)
         try:
             row |= pipe.recv()
         except EOFError:
@@ -409,6 +446,9 @@ def main() -> None:
     options_of.add_argument("--seeds", type=int, default=0, metavar="N", help="one run with each of 1 to N")
     options_of.add_argument("--resolutions", default="0,1", metavar="NUMBERS", help="0: coarse, 1: fine")
     options_of.add_argument("--booleans", type=int, default=0, metavar="N", help="random solids in place of those")
+    options_of.add_argument(
+        "--files", type=Path, metavar="FOLDER", help="solids of all files below it in place of those"
+    )
     options_of.add_argument("--first", type=int, default=0, metavar="N", help="number of the first random solid")
     options_of.add_argument("--cells", type=int, default=1500, metavar="N", help="of each random solid, about")
     options_of.add_argument(
@@ -424,7 +464,7 @@ def main() -> None:
     options = options_of.parse_args()
     shapes: Any = SCENES if options.surfaces else LAYERED if options.layers else SHAPES
     for what, given, known in (
-        ("solid", () if options.booleans else names(options.only), shapes),
+        ("solid", () if options.booleans or options.files else names(options.only), shapes),
         ("resolution", names(options.resolutions), ("0", "1")),
         ("run", names(options.runs), RUNS),
         ("domain", names(options.domains), DOMAINS),
@@ -442,7 +482,7 @@ def main() -> None:
         return report.finish(heading(adapter, "processor time of runs, and of meshes that are read with their faces"))
     require("checkMesh")
     adapter = make_adapter(options)
-    if options.booleans:
+    if options.booleans or options.files:
         report = Report(options.json, BOOLEAN_COLUMNS)
         return report.finish(heading(adapter, measure_booleans(options, report)))
     if options.surfaces:
