@@ -213,7 +213,8 @@ def measure_booleans(options: argparse.Namespace, report: Report) -> str:
         found = sorted(
             p for p in options.files.rglob("*") if p.name.lower().removesuffix(".gz").endswith((".stl", ".obj"))
         )
-        jobs = {f"{p.name}, {what}": (p, what == "outside") for p in found for what in ("inside", "outside")}
+        once = {p.read_bytes(): p for p in reversed(found)}  # tutorials share files
+        jobs = {f"{p.name}, {what}": (p, what == "outside") for p in once.values() for what in ("inside", "outside")}
     for number, job in jobs.items():
         if worker is None or pipe is None:
             pipe, end = context.Pipe()
