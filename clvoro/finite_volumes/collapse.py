@@ -316,5 +316,5 @@ class _Scan:
         np.maximum.at(extent, sets, width)
         np.minimum.at(size, sets, h)
         reach = 1.2 * np.maximum(extent, SHORT_EDGE * size)
-        merges = Merges(starts, vertices, -pack(steps), sets, extent / size, reach)
+        merges = Merges(starts, vertices, -pack(steps), sets, extent / np.maximum(size, 1e-300), reach)
         return merges.take(np.flatnonzero(extent <= widest * size))

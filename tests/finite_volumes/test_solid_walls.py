@@ -3,6 +3,7 @@
 import contextlib
 import itertools
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -218,7 +219,7 @@ def test_a_cell_with_a_concave_crease_is_cut(ctx):
     x[np.linalg.norm(x - (1, 1, 0.5), axis=1) < H] += 0.25 * H * np.array([1, -0.6, 0.1])
     h = np.full(len(x), H)
     with pytest.warns(clvoro.errors.MismatchWarning, match="cells at .* are parts of others"):
-        d = solid_diagram(WallSurface(solid), x, h, lambda x: whole_faces(ctx, solid, x, h))
+        d = solid_diagram(WallSurface(solid), x, h, lambda x: whole_faces(ctx, solid, x, h), centers=False)
     assert d.check("openfoam")
     assert d.check()
     assert d.volumes.sum() == pytest.approx(solid.measure, rel=1e-9)
@@ -372,3 +373,14 @@ def test_few_cells_in_thin_solids(ctx, seed):
     inside = inside[solid.contains(inside)][:3]
     with contextlib.suppress(InputError):
         assert clvoro.Adapter(ctx).diagram(solid, inside).solver_mesh().n_cells <= 3
+
+
+@pytest.mark.parametrize("centers", [True, False])
+def test_generators_move_to_centroids_where_faces_are_oblique(ctx, centers):
+    solid = clvoro.Solid.box((0, 0, 0), (1, 1, 1))
+    x, h = generators(solid), np.full(64, H)
+    x[0] += 0.5 * H * np.array([1, -1, 1])
+    whole = partial(whole_faces, ctx, solid, h=h)
+    d = solid_diagram(WallSurface(solid), x, h, whole, centers=centers)
+    assert (d.faces.measures.non_orthogonality.max() < 20) == centers
+    assert np.array_equal(d.points, x) == (not centers)

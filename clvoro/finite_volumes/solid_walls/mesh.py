@@ -42,6 +42,13 @@ _THIN, _ACROSS = 0.7, 0.35
 across it, over h."""
 _AROUND = 0.85
 """Generators nearer to a concave crease than this share of h stay: the faces between their cells meet in it."""
+_OBLIQUE, _OFF_CENTER = 20.0, 0.15
+"""Angle in degrees between a face and the line through the centroids of both cells, from which their generators are
+moved to the centroids; least distance from these, over h."""
+_CENTERINGS = 3
+"""How often generators are moved there."""
+_WORSE = 1000
+"""How many cells with such faces are as bad as a cell that OpenFOAM rejects."""
 _GOLDEN = (5**0.5 - 1) / 2
 _SIMPLER, _SIMPLER_AFTER = 3, 2
 """How often walls of rejected cells become simpler, at first and after each move of generators."""
@@ -155,6 +162,7 @@ def solid_diagram(
     tell: Callable[[str], object] = lambda _: None,
     warns: bool = True,
     held: int = 0,
+    centers: bool = True,
 ) -> Diagram:
     """Return the mesh of a solid as a diagram, without short edges at walls.
 
@@ -177,6 +185,8 @@ def solid_diagram(
         Whether it warns of what is wrong with the mesh.
     held : int
         How many of the first generators are not moved.
+    centers : bool
+        Move generators to the centroids of their cells where these are far and faces oblique, as at sharp tips.
 
     Raises
     ------
@@ -228,11 +238,41 @@ def solid_diagram(
     def rejected_generators(made: _Made) -> np.ndarray:
         return made.near.numbers[made.home[made.rejected]]
 
+    def oblique_generators(made: _Made) -> np.ndarray:
+        faces, numbers = made.faces, made.near.numbers[made.home]
+        inner = slice(faces.n_inner)
+        pairs = numbers[np.stack([faces.owner[inner], faces.neighbor[inner]])]
+        pairs = pairs[:, (faces.measures.non_orthogonality[inner] > _OBLIQUE) & (pairs >= 0).all(axis=0)]
+        return np.concatenate([np.repeat(rejected_generators(made), _WORSE), pairs.ravel()])
+
+    def center(state: np.ndarray, rows: np.ndarray, number: int) -> np.ndarray:
+        del number
+        made, trial = meshes[-1], state.copy()
+        home = np.where(made.own, made.near.numbers[made.home], -1)
+        cells = np.flatnonzero(np.isin(home, rows[rows >= held]))
+        rows, x = home[cells], made.faces.measures.geometry.centroids[cells]
+        far = np.linalg.norm(x - state[rows, :3], axis=1) > _OFF_CENTER * sizes[rows]
+        far[far] = depth(x[far]) > 0
+        trial[rows[far], :3] = x[far]
+        return trial
+
+    def remake_centered(state: np.ndarray, last: _Made) -> _Made | None:
+        made = remake(state, last)
+        if made is not None:
+            meshes.append(made)
+        return made
+
     goes_on = [True] * _SIMPLER + MOVES * [False, *[True] * _SIMPLER_AFTER]
     state = np.column_stack([points, np.full(len(points), EXACT)])
     first = remake(state, None)
     assert first is not None
     mesh = fewest_rejected(first, state, sizes, rejected_generators, change, remake, goes_on)
+    state[:, :3], state[:, 3] = mesh.near.points, EXACT
+    state[mesh.near.rows, 3] = mesh.walls[:-1]
+    meshes = [mesh]
+    trials = [True] * _CENTERINGS if centers else []
+    centered = fewest_rejected(mesh, state, sizes, oblique_generators, center, remake_centered, trials)
+    mesh = min(centered, mesh, key=lambda made: len(made.rejected))
     near, points = mesh.near, mesh.near.points
     rejected = mesh.faces.generators[mesh.rejected]
     tell("cells without walls")

@@ -36,7 +36,7 @@ LEFT_OUT = 1e-5
 
 
 def fetch_diagram(
-    engine: Engine, domain: Domain, t: Tessellation, labels: cla.Array, copy: bool = True, held: int = 0
+    engine: Engine, domain: Domain, t: Tessellation, labels: cla.Array, copy: bool = True, held: int | None = None
 ) -> Diagram:
     """Return `t` as a `Diagram` with rows in the order of `labels` (n,); arrays are read when first used.
 
@@ -44,8 +44,9 @@ def fetch_diagram(
     ----------
     copy : bool
         Copy the arrays of `t`. Without a copy the caller must not reuse these buffers.
-    held : int
-        How many of the first generators are not moved where OpenFOAM would reject cells.
+    held : int, optional
+        How many of the first generators of a run are not moved. Given generators are moved only where OpenFOAM would
+        reject cells.
     """
     sheets = domain.sheets
     if domain.curved_walls:
@@ -71,7 +72,7 @@ def fetch_diagram(
             stages.release()
             return made
 
-    return diagram if sheets is None else on_surfaces(diagram, sheets, points, sizes, again, held)
+    return diagram if sheets is None else on_surfaces(diagram, sheets, points, sizes, again, held or 0)
 
 
 def make_diagram(

@@ -23,7 +23,7 @@ from ..tessellator import Tessellator
 from .diagram import fetch_diagram, order_of, starts_of
 
 
-def fetch_part(engine: Engine, domain: Domain, t: Tessellation, labels: cla.Array, held: int = 0) -> Diagram:
+def fetch_part(engine: Engine, domain: Domain, t: Tessellation, labels: cla.Array, held: int | None = None) -> Diagram:
     """Return the cells of a part in the order of `labels` (n,). Faces towards cells of part k are walls ``"rankK"``."""
     if t.part is None:
         return fetch_diagram(engine, domain, t, labels, copy=False, held=held)

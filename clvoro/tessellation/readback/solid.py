@@ -52,13 +52,14 @@ def make_mesh(
     sizes: np.ndarray,
     warns: bool = True,
     spread: bool = True,
-    held: int = 0,
+    held: int | None = 0,
 ) -> Diagram:
     """Return the mesh of a solid by its generators `points` (n, 3), for cells of the `sizes` (n,).
 
     In a run each cell is cut by planes of its own, and cells do not fit together. The mesh has the Voronoi cells of the
     same generators, cut at the surface. With `warns` the function warns of defects of the mesh. With `spread` those in
-    thin parts do not stay halfway between the walls. The first `held` generators are not moved.
+    thin parts do not stay halfway between the walls. The first `held` generators are not moved; if it is None, all are
+    given, and move only where OpenFOAM would reject cells.
     """
     tell = engine.pool.on_work or (lambda _: None)
     tell("diagram of all cells")
@@ -76,4 +77,5 @@ def make_mesh(
         stages.release()
         return faces
 
-    return solid_diagram(surface, points, sizes, whole, tell, warns, held)
+    centers = held is not None and domain.sheets is None
+    return solid_diagram(surface, points, sizes, whole, tell, warns, held or 0, centers)
