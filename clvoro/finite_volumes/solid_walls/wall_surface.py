@@ -50,6 +50,18 @@ class WallSurface:
         """Site of the first corner."""
         return self.n_patches + len(self.ends)
 
+    @cached_property
+    def widths(self) -> np.ndarray:
+        """Width of each patch if it is long and narrow, (p,) float: twice its area over the length around it."""
+        length = np.repeat(np.linalg.norm(self.ends[:, 1] - self.ends[:, 0], axis=1), 2)
+        around = np.bincount(self.solid.creases.patches.ravel(), length, self.n_patches)
+        area = np.bincount(self.patch, self.solid.surface.areas, self.n_patches) * self.solid.extent.max() ** 2
+        return 2 * area / np.maximum(around, 1e-300)
+
+    def has_narrow(self, sizes: np.ndarray) -> bool:
+        """Return whether vertices on some patch are near creases on both of its sides, for cells of `sizes` (n,)."""
+        return bool(self.widths.min() < SNAP_CREASE * sizes.max(initial=0.0))
+
     def closest(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the closest triangle (k,), the point on it (k, 3), and the distance (k,), negative inside."""
         return self.solid.closest(points, None if self._nearest is None else self._nearest(points, np.inf))

@@ -4,9 +4,10 @@ Nodes divide a chain of creases into chords, equidistributed by 1 / h; a chain s
 node is a ball without other generators. Beside a chord k generators stand where the spheres around its two ends
 intersect, in the middle of k equal sectors. With the mean interior angle alpha of the chain, k = round(alpha / 90
 degrees); a chord where sectors would be wider than 120 degrees has more. So all their bisectors contain the chord, and
-each of the outermost two is nearest to one wall only. Chains that meet in a corner share the node there. Generators of
-two chains that are near each other become one, on the spheres of both. Mirror images of the generators in the walls
-there complete the corner.
+each of the outermost two is nearest to one wall only. Two chords on both sides of a facet that is narrower than a cell,
+as at the rim of a plate, share the angle around both: the middle of the facet is the border between their sectors.
+Chains that meet in a corner share the node there. Generators of two chains that are near each other become one, on the
+spheres of both. Mirror images of the generators in the walls there complete the corner.
 
 A generator has no room if a wall or another generator is near, or if a ball around its crease holds a generator of
 another one. Then the generators around that chord come nearer to it, step by step. If the least distance does not
@@ -40,6 +41,9 @@ _SHORTEST = 0.3  # over h: shorter creases have no generators of their own
 _SHRINKAGE, _LEAST = 0.8, 0.2  # of the scale of chords whose generators have no room: factor of a step, and end
 _WIDEST, _WIDEST_CROWDED = math.radians(120), math.radians(150)  # sectors, and those where there is little room
 _SHORT = 0.8  # over the radius at its first end: a shorter chord has the same radius at both ends
+_NARROW = 0.75  # of h: two chords this near to each other on one patch share the sectors around both
+_ON_FACET, _PARALLEL = 0.2, 0.8  # of their distance: how far its middle is from the patch; product of their directions
+_TILT = math.radians(8)  # of faces between sectors against a narrow facet, at least
 _CURVED = math.radians(25)  # mean angle between neighboring chords above which a crease is a narrow curve
 _SAMPLES = 8  # of 1 / h per step, at least
 _FEWEST = 64  # samples per chain, at least
@@ -111,6 +115,7 @@ def place_stations(solid: Solid, size: Callable[[np.ndarray], np.ndarray]) -> St
     """Return the stations of a solid for the sizes h = size(points (n, 3))."""
     chains = [_Crease(solid, c, size) for c in np.unique(solid.creases.chain[solid.creases.concave]).tolist()]
     chains = [chain for chain in chains if len(chain.h)]
+    chains = _share_sectors(solid, chains)
     while True:
         placing = _placed(solid, chains)
         ends = np.cumsum([len(chain.h) for chain in chains])
@@ -140,6 +145,41 @@ def _shortest_nearby(chains: Sequence[_Crease], crowded: list[int], spots: list[
     rank = np.array([len(chain.h) for chain in chains]) * len(chains) + np.arange(len(chains))
     later = np.where(rank[i] > rank[j], i, j)
     return np.setdiff1d(crowded, later[i != j]).tolist()
+
+
+def _share_sectors(solid: Solid, chains: list[_Crease]) -> list[_Crease]:
+    """Let chords on both sides of a narrow facet share the sectors around both.
+
+    The other chains are returned with them, without those along the ends of such facets, around which the generators of
+    both sides are.
+    """
+    if not chains:
+        return chains
+    item = [(chain, i) for chain in chains for i in range(len(chain.h))]
+    middle = np.concatenate([chain.line.along(chain.line.points, chain.middle) for chain in chains])
+    ways, h, angle = (np.concatenate([getattr(c, name) for c in chains]) for name in ("ways", "full", "angle"))
+    near = scipy.spatial.KDTree(middle).query_pairs(_NARROW * math.sqrt(2) * h.max(), output_type="ndarray")
+    i, j = np.concatenate([near, near[:, ::-1]]).T
+    # The chords may be a little ahead of each other.
+    gap = middle[j] - middle[i]
+    across = gap - (gap * ways[i]).sum(axis=1)[:, None] * ways[i]
+    width = np.linalg.norm(across, axis=1)
+    toward = across / np.maximum(width, 1e-300)[:, None]
+    facing = np.zeros((2, 2, len(i)))  # of both chords, how far their walls to the left and right face the other one
+    for side in range(2):
+        walls = np.array([chain.wall(row, side) for chain, row in item])
+        facing[:, side] = (walls[i] * toward).sum(axis=1), -(walls[j] * toward).sum(axis=1)
+    facet = facing.argmax(axis=1)
+    same = (ways[i] * ways[j]).sum(axis=1) * np.where(facet[0] == facet[1], -1, 1)
+    good = (width < _NARROW * h[i]) & (np.abs(gap - across).max(axis=1) < _NARROW * h[i])
+    good &= (facing.max(axis=1) > _PARALLEL).all(axis=0) & (same > _PARALLEL)
+    good &= np.minimum(angle[i], angle[j]) > math.pi
+    good[good] = np.abs(solid.signed_distance(middle[i[good]] + 0.5 * across[good])) < _ON_FACET * width[good]
+    for k in np.flatnonzero(good)[np.argsort(-width[good], kind="stable")].tolist():  # the nearest last
+        chain, row = item[i[k]]
+        chain.share(row, 0.5 * (angle[i[k]] + angle[j[k]] - math.pi), bool(facet[0, k] == 1))
+    shared = {v for c in chains for v, end in zip(c.vertices.tolist(), (0, -1), strict=True) if c.shared[end]}
+    return [c for c in chains if c.line.at[-1] > _NARROW * c.full[0] or not shared.issuperset(c.vertices.tolist())]
 
 
 def _placed(solid: Solid, chains: Sequence[_Crease]) -> AroundCreases:
@@ -230,6 +270,11 @@ class _Crease(ChainOfChords):
         Their size over the full one. Below `_LEAST` it stays.
     sectors : (n,) int
         The number of generators around each chord.
+    span : (n,) float
+        The angle that they divide.
+    shared, turned : (n,) bool
+        Whether it is less than `angle`, since there is another crease on a narrow facet; and whether it ends, not
+        begins, at the left wall.
     """
 
     def __init__(self, solid: Solid, number: int, size: Callable[[np.ndarray], np.ndarray]) -> None:
@@ -242,6 +287,7 @@ class _Crease(ChainOfChords):
         left, right = (_unit(n - (n * self.ways).sum(axis=1)[:, None] * self.ways) for n in (left, right))
         sine, cosine = (np.cross(left, right) * self.ways).sum(axis=1), (left * right).sum(axis=1)
         self.angle = math.pi - np.arctan2(sine, cosine)
+        self.span, (self.shared, self.turned) = self.angle.copy(), np.zeros((2, len(self.h)), bool)
         # Where the number changes along the chain, faces between cells are oblique.
         usual = np.rint(self.angle.mean() / (math.pi / 2)) if len(self.angle) else 2
         self.sectors = np.maximum(usual, np.ceil(self.angle / _WIDEST)).astype(int)
@@ -252,9 +298,10 @@ class _Crease(ChainOfChords):
         """Set the sizes, angles and radii that follow from scale and sectors."""
         self.h = self.full * self.scale
         self.turns = [
-            (np.arange(n) + 0.5) * (a / max(n, 1)) for n, a in zip(self.sectors.tolist(), self.angle, strict=True)
+            (np.arange(n) + 0.5) * (a / max(n, 1)) for n, a in zip(self.sectors.tolist(), self.span, strict=True)
         ]
-        half = 0.5 * self.angle / np.maximum(self.sectors, 2)
+        self.turns = [a - t if back else t for t, a, back in zip(self.turns, self.angle, self.turned, strict=True)]
+        half = 0.5 * self.span / np.where(self.sectors, self.sectors, 2)
         # A cell is a kite with the area h^2 whose tip is on the crease; its generator is at the centroid.
         self.set_radii(self.h / np.sqrt(np.tan(half)) * (np.cos(half) + 1 / np.cos(half)) / 3)
 
@@ -264,6 +311,22 @@ class _Crease(ChainOfChords):
         turn = np.einsum("ij,ij->i", self.ways[1:], self.ways[:-1])
         return (self.scale < 1) | bool(len(turn) and np.arccos(np.clip(turn, -1, 1)).mean() > _CURVED)
 
+    def wall(self, chord: int, side: int) -> np.ndarray:
+        """Return the direction (3,) from a chord into the wall to its left, `side` 0, or to its right, 1."""
+        turn, (one, other) = side * self.angle[chord], self.axes[chord]
+        return math.cos(turn) * one + math.sin(turn) * other
+
+    def share(self, chord: int, span: float, facet_right: bool) -> None:
+        """Divide only the angle `span` around a chord, from the wall that is not the facet."""
+        self.sectors[chord] = n = max(round(span / (math.pi / 2)), 1)
+        # No face between two of the sectors goes on along the facet beyond the crease.
+        along = self.angle[chord] - math.pi
+        m = min(range(1, n), key=lambda k: abs(k * span / n - along), default=0)
+        if m and abs(m * span / n - along) < _TILT:
+            span = (along + _TILT) * n / m
+        self.span[chord], self.shared[chord], self.turned[chord] = span, True, not facet_right
+        self._arrange()
+
     def shrink(self, crowded: np.ndarray) -> bool:
         """Move the generators at `crowded` chords (n,) bool nearer to these; return whether that has been possible.
 
@@ -271,7 +334,7 @@ class _Crease(ChainOfChords):
         """
         crowded = crowded & (self.scale >= _LEAST)
         self.scale[crowded] *= _SHRINKAGE
-        fewest = np.ceil(self.angle / _WIDEST_CROWDED).astype(int)
+        fewest = np.ceil(self.span / _WIDEST_CROWDED).astype(int)
         again = crowded & (self.scale < _LEAST) & (fewest < self.sectors)
         self.sectors[again], self.scale[again] = fewest[again], 1
         self._arrange()

@@ -95,6 +95,20 @@ def test_generators_come_nearer_to_creases_where_there_is_little_room():
     assert other.with_others(stations, lambda x: np.full(len(x), 1e-3)).n_sized == stations.n_sized - 1
 
 
+@pytest.mark.parametrize("thickness", [0.02, 0.08, 0.13])
+def test_creases_on_both_sides_of_a_narrow_facet_share_the_sectors_around_them(thickness):
+    """All around a thin plate cells have their whole size, and the creases are equidistant from two generators."""
+    h, y = 0.2, 0.5 * thickness
+    solid = Solid.outside(Solid.box((0, -y, 0), (1, y, 1)), ((-1, -1, -1), (2, 1, 2)))
+    stations = solid.stations(lambda x: np.full(len(x), h))
+    assert len(stations.left_out) == stations.n_sized == 0
+    at = np.column_stack([np.linspace(0.01, 0.99, 50), np.full(50, y), np.full(50, 1.0)])
+    assert ties(stations, at, 2) == pytest.approx(1, abs=1e-9)
+    # The facet belongs to the cells beyond it.
+    inner = KDTree(stations.points).query(at - [0, 0.25 * y, 0])[1]
+    assert (stations.points[inner, 2] > 1).all()
+
+
 def test_cells_around_narrow_curves_have_their_own_sizes():
     for h, share in ((0.2, 0), (0.25, 1)):
         stations = STEPPED.stations(lambda x, h=h: np.full(len(x), h))
