@@ -17,6 +17,8 @@ LEAST_BULGE = 0.1
 """Distance from a straight side over the size of the cell at which a vertex of the domain becomes a corner of it."""
 FILLED = 0.5
 """Share of the triangle of a corner and the ends of the side that must lie in the domain, or it is cut off."""
+LEAST_AREA = 1e-3
+"""What straight sides must enclose of the area of a cell, or it keeps its own sides, as in the kernel `trim`."""
 
 
 def count_sides(diagram: Diagram) -> np.ndarray:
@@ -46,7 +48,7 @@ def straighten(diagram: Diagram) -> Straightened:
     Each face between cells is a side. Along the boundary a cell has one straight side from its first to its last point
     on a ring, with the convex corners of the domain between that `choose_corners` finds; re-entrant corners are cut
     off. A ring that is a whole cell stays as it is, and holes within a cell are not sides. Cells with fewer than three
-    sides remain as they are. In a box the sides are the faces.
+    sides, and those whose sides enclose next to nothing, remain as they are. In a box the sides are the faces.
     """
     counts, n = np.diff(diagram.neighbor_starts), len(diagram)
     owner, measures = diagram.half_faces.owner, diagram.face_measures
@@ -62,9 +64,10 @@ def straighten(diagram: Diagram) -> Straightened:
     cell = np.concatenate([owner[inner], sides.cell])
     number = np.bincount(cell, minlength=n)
     areas = np.bincount(cell, cross(p, q) / 2, n)
-    made = (number >= 3) & (areas > 0)
+    made = (number >= 3) & (areas > LEAST_AREA * diagram.volumes)
     length = np.bincount(cell, np.hypot(*(q - p).T), n)
-    return Straightened(number, np.where(made, areas, diagram.volumes), np.where(made, length, perimeters))
+    areas, perimeters = np.where(made, areas, diagram.volumes), np.where(made, length, perimeters)
+    return Straightened(np.where(made, number, np.minimum(number, 3)), areas, perimeters)
 
 
 def cell_quality(diagram: Diagram, surfaces: np.ndarray) -> np.ndarray:
