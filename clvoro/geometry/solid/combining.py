@@ -11,6 +11,8 @@ from ...errors import InputError, MissingLibraryError
 if TYPE_CHECKING:
     from .solid import Solid
 
+_ON_SIDE = 1e-9
+"""Distance of vertices of a body from a side of its box, over the extent of the box, up to which they are on it."""
 NamedTriangles = tuple[np.ndarray, np.ndarray, np.ndarray, list[str]]
 """Vertices (v, 3), triangles (t, 3), group of each triangle (t,), and the names of the groups."""
 
@@ -52,6 +54,9 @@ def around(body: Solid, box: Solid) -> dict[str, Any]:
             f"Solid.outside got a body from {body.lower} to {body.upper} and a box from {box.lower} to {box.upper}, "
             "which do not overlap; do they have the same unit? Solid.read has units="
         )
+    # A body that stands on a side is on it up to round-off only.
+    for side in (np.array(box.lower), np.array(box.upper)):
+        vertices = np.where(np.abs(vertices - side) < _ON_SIDE * box.extent.max(), side, vertices)
     return boolean("-", named_triangles(box), (vertices, triangles[outside], groups[outside], names))
 
 

@@ -95,6 +95,8 @@ def test_booleans_keep_names():
     assert (CUBE + pin).measure == pytest.approx(1 + 2 * area)
     assert (CUBE & pin).measure == pytest.approx(area)
     on_floor = Solid.outside(CUBE, ((-1, -1, 0), (2, 2, 2)))
+    uneven = Solid(V + 1e-16 * np.random.default_rng(0).standard_normal(V.shape), T)
+    assert Solid.outside(uneven, ((-1, -1, 0), (2, 2, 2))).measure == pytest.approx(17)
     assert on_floor.measure == pytest.approx(17)
     with pytest.raises(InputError, match="leaves nothing"):
         CUBE - Solid.box((-1, -1, -1), (2, 2, 2))
