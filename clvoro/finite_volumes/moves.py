@@ -91,11 +91,13 @@ def fewest_rejected(
 
 
 def _groups(points: np.ndarray, sizes: np.ndarray, rows: np.ndarray) -> tuple[int, np.ndarray]:
-    """Return the number of groups of near generators, and the group of each of `rows` (k,) int."""
+    """Return the number of groups of near generators, and the group of each of `rows` (k,) int, which may repeat."""
+    rows, again = np.unique(rows, return_inverse=True)
     x, h = points[rows], _GROUP * sizes[rows]
     pairs = scipy.spatial.KDTree(x).query_pairs(float(h.max()), output_type="ndarray")
     apart = np.linalg.norm(x[pairs[:, 0]] - x[pairs[:, 1]], axis=1)
-    return connect(len(rows), pairs[apart < h[pairs].min(axis=1)])
+    count, group = connect(len(rows), pairs[apart < h[pairs].min(axis=1)])
+    return count, group[again]
 
 
 def moved(

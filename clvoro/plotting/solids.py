@@ -481,8 +481,9 @@ def _label_axes(ax: Any, diagram: Diagram, right: np.ndarray, up: np.ndarray, to
         edge = screen[axis] / np.linalg.norm(screen[axis])
         outwards = np.array([-edge[1], edge[0]])
         outwards *= np.sign(outwards @ (place - center @ screen)) or 1
+        ends = np.where(np.abs(box[:, axis]) < 1e-9 * np.ptp(box), 0.0, box[:, axis])
         ax.annotate(
-            f"${name}$ from {box[0, axis]:g} to {box[1, axis]:g}".replace("-", "−"),
+            f"${name}$ from {ends[0]:g} to {ends[1]:g}".replace("-", "−"),
             place,
             rotation=90 - (90 - math.degrees(math.atan2(edge[1], edge[0]))) % 180,  # in (-90, 90]
             rotation_mode="default",
