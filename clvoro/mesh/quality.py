@@ -106,7 +106,7 @@ class Measures:
         """Return the mean and the worst of every measure, by name.
 
         Means of `centroid_angle` and `volume_ratio` are over the faces between cells, and so are mean and maximum of
-        `skewness` in a polygonal domain, whose walls may have generators behind them. On a sphere those of `c_grid`
+        `skewness` in a polygon or solid, whose walls may have generators behind them. On a sphere those of `c_grid`
         follow.
         """
         domain = self.diagram.domain
@@ -114,8 +114,8 @@ class Measures:
         angle, ratio = (
             values[self.inner] if self.inner.any() else values for values in (self.centroid_angle, self.volume_ratio)
         )
-        cut = domain.cuts_cells and self.inner.any()
-        skewness = self.skewness[self.inner] if cut else self.skewness
+        between = not domain.plain and self.inner.any()
+        skewness = self.skewness[self.inner] if between else self.skewness
         return {
             "mean_faces": float(self.faces.mean()),
             "mean_quality": float(self.quality.mean()),
