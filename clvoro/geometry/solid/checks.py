@@ -212,8 +212,14 @@ def _caps(surface: Surface) -> list[np.ndarray]:
     """
     caps = []
     rings = [ring for ring in _rings(surface.open_edges) if len(ring) > 2]
+    ends = np.stack([surface.triangles, np.roll(surface.triangles, -1, axis=1)], axis=2).reshape(-1, 2)
+    part = connect(len(surface.vertices), ends)[1]
     fits = enumerate(_plane(surface.vertices[ring]) for ring in rings)
     planes = {k: plane for k, plane in fits if plane is not None}
+    for k, (center, axes, tolerance) in list(planes.items()):
+        away = (surface.vertices[part == part[rings[k][0]]] - center) @ axes[2]
+        if np.abs(away).max() <= tolerance:
+            del planes[k]  # the border of a flat sheet
     left = list(planes)
     while left:
         center, axes, tolerance = planes[left[0]]

@@ -179,6 +179,11 @@ def test_repair_mends_what_is_certain_and_says_so(vertices, triangles, says, vol
     assert holes == (["hole-1", "hole-2"] if "holes" in says else [])
 
 
+def test_a_flat_sheet_stays_open():
+    with pytest.raises(InputError, match="is open: 4 edges"):
+        Solid(V, T[:2], repair=True)
+
+
 def test_vertices_within_round_off_are_one():
     assert Solid(*with_gap(1e-15)).measure == pytest.approx(1)
 
