@@ -333,7 +333,8 @@ def _in_all_pieces(domain: Domain, points: np.ndarray) -> np.ndarray:
     if len(points) < domain.n_pieces:
         raise InputError(f"n is {len(points)}, expected at least {domain.n_pieces}, one per piece of the domain")
     piece = domain.piece_of(points)
-    counts = np.bincount(piece, minlength=domain.n_pieces)
+    # By round-off, points of the caller may be in none.
+    counts = np.bincount(piece[piece >= 0], minlength=domain.n_pieces)
     for missing in np.flatnonzero(counts == 0).tolist():
         most = int(np.argmax(counts))
         row = np.flatnonzero(piece == most)[-1]
