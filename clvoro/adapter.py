@@ -459,9 +459,9 @@ class Adapter:
             end with exactly that many. They scale the size field by a common factor so that the mean of log(L / h)
             vanishes, and report it as ``Result.size_factor``; "transport" always does.
         layers : Layers or sequence of Layers
-            Rows of generators along walls of a box in 2D or a polygon. They do not move and are the first rows of the
-            result. Beyond them the sizes grow gradually from the size of the layers; see `Layers`. Their cells count as
-            having the right size.
+            Rows of generators along walls of a box in 2D or a polygon. They do not move. In the result they follow
+            `fixed` and the generators that a run places in concave corners. Beyond them the sizes grow gradually from
+            the size of the layers; see `Layers`. Their cells count as having the right size.
         fixed : (k, d) array of float, optional
             Generators that do not move, such as wells: rows 0 to k - 1 of the result, exactly at these positions. Their
             neighbors move until all have their sizes. Not for "transport" and moving meshes, which move all of them.

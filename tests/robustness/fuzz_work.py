@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import scipy
 import shapely
 
 import clvoro
@@ -125,9 +126,11 @@ def try_layers(rng: np.random.Generator) -> str:
     # Coordinates of the device are relative to the frame, those of the host to 0.
     slack = 8 * np.finfo(real).eps * domain.extent.max()
     slack += 4 * sum(np.spacing(np.abs(corner).max()) for corner in (domain.upper, domain.lower))
-    if not np.abs(result.points[: len(rows)] - rows).max() <= slack:
+    distance, at = scipy.spatial.KDTree(result.points).query(rows)
+    if not distance.max() <= slack:
         raise Wrong("a layer's generator has moved")
-    others = result.points[len(rows) :]
+    rest = np.delete(np.arange(len(result.points)), at)
+    others = result.points[rest]
     if isinstance(domain, clvoro.Box):
         away = np.abs(others - np.clip(others, free.lower, free.upper)).max(initial=0)
     else:
@@ -136,7 +139,7 @@ def try_layers(rng: np.random.Generator) -> str:
         parts = shapely.get_parts(free.geometry)
         for k in np.flatnonzero(away > slack):
             nearest = parts[np.argmin(shapely.distance(parts, shapely.Point(others[k])))]
-            small = nearest.area < 4 * result.target_size[len(rows) + k] ** 2
+            small = nearest.area < 4 * result.target_size[rest[k]] ** 2
             away[k] = 0 if small else away[k]
         away = away.max(initial=0)
     demand(result, real)
