@@ -46,7 +46,7 @@ class CellCount(NamedTuple):
     target: int
     """Number of cells of the finest level."""
     factor: float
-    """Factor on the size field with which it requires `target` cells."""
+    """The size field times this factor asks for `target` cells."""
 
 
 @dataclass(frozen=True)

@@ -145,13 +145,16 @@ def _made(diagram: Diagram, sheets: Sheets) -> _OnSurfaces:
 
 
 def _rejected(diagram: Diagram, among: np.ndarray) -> np.ndarray:
-    """Return the rejected cells (k,) `among` (n,) bool, of those with a face on a surface and their neighbors."""
+    """Return the numbers (k,) of the cells `among` (n,) bool that OpenFOAM rejects, near surfaces only.
+
+    These cells have a face on a surface, or a neighbor with one.
+    """
     beside = _beside(diagram)
     return rejected_among(diagram.faces, beside & among, beside)
 
 
 def _around(mesh: Faces, row: int) -> np.ndarray:
-    """Return which cells share a corner with the face `row`, or have such a neighbor, (n,) bool."""
+    """Return which cells have a vertex of the face `row`, or a neighbor that has one, (n,) bool."""
     corners = mesh.corners[mesh.starts[row] : mesh.starts[row + 1]]
     return with_neighbors(mesh, cells_of(mesh, rows_with(mesh.starts, np.isin(mesh.corners, corners))))
 

@@ -413,8 +413,8 @@ class _Loop:
         size = self._sizes_in_window(fields, old, latest)
         layers = tuple(_layers_of(note["layers"])) if self.layers is None else self.layers
         domain = old.diagram.domain
-        # Generators that move keep their number along walls, whatever the sizes are there: a steady flow gets new ones.
-        # Fields of an unsteady flow lose less in a transfer between similar meshes.
+        # A run from given generators keeps their number along walls, even where sizes have changed: a steady flow gets
+        # a new mesh. Fields of an unsteady flow lose less in a transfer between similar meshes.
         points = old.diagram.points if self.window else None
         made = self.adapter.run(domain, size, self.effort, points=points, n_cells=self.n_cells, layers=layers)
         mesh_seconds = time.perf_counter() - start

@@ -421,7 +421,7 @@ class LayerPrisms:
         return np.asarray(size(self.walls[k].landmarks(float(self.free.extent.min()) / 8, most)), float)
 
     def count(self, size: Callable[[np.ndarray], np.ndarray]) -> float:
-        """Return about how many prisms there are, where wall polygons are as wide as `size` at points."""
+        """Return an estimate of the number of prisms, for wall polygons as wide as the size field, `size(points)`."""
         total = 0.0
         for k, layer in enumerate(self.layers):
             h, edges = self.sample(k, size, _SAMPLE), np.diff(self.walls[k].corners, axis=1).swapaxes(0, 1)
@@ -430,9 +430,9 @@ class LayerPrisms:
         return total
 
     def compression(self, k: int, h: float) -> tuple[float, float]:
-        """Return by which factor the prisms of layer `k` shrink cells of size `h` below them, and down to which depth.
+        """Return by which factor the prisms of layer `k` shrink the cells of size `h` near them, and to which depth.
 
-        Prisms push the vertices near walls inwards. They leave cells at a greater depth below the walls as they are.
+        Prisms push vertices near walls inwards. Cells deeper below the walls stay as they are.
         """
         solid, layer = self.free, self.layers[k]
         depth = INNER_DEPTH * h + DEEPER * layer.thickness

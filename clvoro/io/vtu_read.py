@@ -41,7 +41,7 @@ END = b"\n</AppendedData>\n</VTKFile>\n"
 _TYPES = {"Float64": "f8", "Float32": "f4", "Int32": "i4", "Int64": "i8", "UInt8": "u1"}
 _BLOCK = 1 << 20
 _SAME_VOLUME = 1e-3
-"""Largest relative difference between the volumes of a cell in a file and after its tessellation in float32."""
+"""Largest relative difference between the volume of a cell in a float32 file and that of the cell made anew."""
 _USED = {
     "Points.",
     "Cells.types",

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 FLAT = 1e-6
-"""Largest distance of a corner from the plane of a face that counts as plane, over the width of the cell."""
+"""A face counts as plane if its corners are nearer to a plane than this, over the width of the cell."""
 
 
 class HalfFaceArrays:

@@ -64,7 +64,7 @@ class Places(NamedTuple):
     longest: float
     """The largest size."""
     limit: Callable[[np.ndarray], np.ndarray] | None = None
-    """Limits the growth of sizes, and may smooth them. It increases with the sizes."""
+    """Returns sizes whose growth is limited, and which may be smoother. Larger sizes give larger ones."""
 
 
 def best_sizes(

@@ -19,6 +19,7 @@ typedef struct {
 
 #define LEAST_BULGE R(0.1) /* distance of a corner from the side, over the size of the cell */
 #define FILLED R(0.5)      /* share of its triangle that lies in the domain */
+#define LEAST_AREA R(1e-3) /* what straight sides must enclose of the area of a cell */
 #define MOST_PARTS 16      /* parts of a run that wait to be divided */
 
 /* The boundary of the cells of a clipped diagram.

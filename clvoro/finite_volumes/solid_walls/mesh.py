@@ -222,7 +222,9 @@ def solid_diagram(
             if last is None:
                 raise
             return None
-        return _finished(surface, raw, None if last is None else last.cures, tell)
+        made = _finished(surface, raw, None if last is None else last.cures, tell)
+        latest[:] = [made]
+        return made
 
     def change(state: np.ndarray, rows: np.ndarray, number: int) -> np.ndarray:
         trial = state.copy()
@@ -234,7 +236,7 @@ def solid_diagram(
             trial[rows, 3] = EXACT
             if not surface.has_narrow(sizes):
                 return trial
-            # Generators around concave creases move only where their own cells are rejected.
+            # Generators around concave creases stay, unless OpenFOAM rejects their own cells.
             beside = np.setdiff1d(np.flatnonzero((trial[:, :3] != state[:, :3]).any(axis=1)), rows)
             edge = surface.nearest_crease(state[beside, :3], _AROUND * sizes[beside])[0]
             beside = beside[edge >= 0][surface.solid.creases.concave[edge[edge >= 0]]]
@@ -262,7 +264,7 @@ def solid_diagram(
 
     def center(state: np.ndarray, rows: np.ndarray, number: int) -> np.ndarray:
         del number
-        made, trial = meshes[-1], state.copy()
+        made, trial = latest[0], state.copy()
         home = np.where(made.own, made.near.numbers[made.home], -1)
         cells = np.flatnonzero(np.isin(home, rows[rows >= held]))
         rows, x = home[cells], made.faces.measures.geometry.centroids[cells]
@@ -271,12 +273,7 @@ def solid_diagram(
         trial[rows[far], :3] = x[far]
         return trial
 
-    def remake_centered(state: np.ndarray, last: _Made) -> _Made | None:
-        made = remake(state, last)
-        if made is not None:
-            meshes.append(made)
-        return made
-
+    latest: list[_Made] = []
     goes_on = [True] * _SIMPLER + MOVES * [False, *[True] * _SIMPLER_AFTER]
     state = np.column_stack([points, np.full(len(points), EXACT)])
     first = remake(state, None)
@@ -284,14 +281,25 @@ def solid_diagram(
     mesh = fewest_rejected(first, state, sizes, rejected_generators, change, remake, goes_on)
     state[:, :3], state[:, 3] = mesh.near.points, EXACT
     state[mesh.near.rows, 3] = mesh.walls[:-1]
-    meshes = [mesh]
+    latest[:] = [mesh]
     trials = [True] * _CENTERINGS if centers else []
-    centered = fewest_rejected(mesh, state, sizes, oblique_generators, center, remake_centered, trials)
+    centered = fewest_rejected(mesh, state, sizes, oblique_generators, center, remake, trials)
     mesh = min(centered, mesh, key=lambda made: len(made.rejected))
-    near, points = mesh.near, mesh.near.points
-    rejected = mesh.faces.generators[mesh.rejected]
     tell("cells without walls")
-    faces, home = near.put_back(mesh.faces, mesh.home, mesh.own)
+    faces, home = mesh.near.put_back(mesh.faces, mesh.home, mesh.own)
+    if warns:
+        _warn_of(mesh, home)
+    diagram = diagram_of(faces)
+    diagram.home = home
+    return diagram
+
+
+def _warn_of(mesh: _Made, home: np.ndarray) -> None:
+    """Warn of generators without cells, and of cells that are cut, leave out creases, or are rejected.
+
+    `home` is that of all cells of the diagram; see `solid_diagram`.
+    """
+    near, points, rejected = mesh.near, mesh.near.points, mesh.faces.generators[mesh.rejected]
     lost = np.setdiff1d(np.arange(len(points)), home)
     for rows, text in (
         (points[lost], "generators at {} have no cell: the solid is thinner than a cell, which is left out"),
@@ -302,12 +310,9 @@ def solid_diagram(
         ),
         (rejected, "cells at {} are concave, inverted, or as thin as the solid, and OpenFOAM does not accept them"),
     ):
-        if warns and len(rows):
+        if len(rows):
             place = format_point(rows[0]) + (" and elsewhere" if len(rows) > 1 else "")
             warn(f"{len(rows)} {text.format(place)}; use smaller sizes there", MismatchWarning)
-    diagram = diagram_of(faces)
-    diagram.home = home
-    return diagram
 
 
 def _check_lost(surface: WallSurface, near: NearWalls, home: np.ndarray) -> None:
@@ -757,7 +762,7 @@ class _Maker:
         return label
 
     def _labels(self, cell: np.ndarray, begin: np.ndarray, end: np.ndarray) -> np.ndarray:
-        """Return the patch of each side at a wall: that of both ends, or the nearest to its middle.
+        """Return the patch of each side at a wall: the one that both ends are on, or else the nearest to its middle.
 
         Vertices on a facet narrower than `SNAP_CREASE` may lie on the patch beside it, too, and the nearest one counts.
         """

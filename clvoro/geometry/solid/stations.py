@@ -156,11 +156,11 @@ def _share_sectors(solid: Solid, chains: list[_Crease]) -> list[_Crease]:
     if not chains:
         return chains
     item = [(chain, i) for chain in chains for i in range(len(chain.h))]
-    middle = np.concatenate([chain.line.along(chain.line.points, chain.middle) for chain in chains])
+    middle = np.concatenate([chain.spots for chain in chains])
     ways, h, angle = (np.concatenate([getattr(c, name) for c in chains]) for name in ("ways", "full", "angle"))
     near = scipy.spatial.KDTree(middle).query_pairs(_NARROW * math.sqrt(2) * h.max(), output_type="ndarray")
     i, j = np.concatenate([near, near[:, ::-1]]).T
-    # The chords may be a little ahead of each other.
+    # Chords on both sides may be shifted along the facet.
     gap = middle[j] - middle[i]
     across = gap - (gap * ways[i]).sum(axis=1)[:, None] * ways[i]
     width = np.linalg.norm(across, axis=1)

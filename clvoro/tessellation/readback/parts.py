@@ -88,7 +88,7 @@ def unfolded(domain: Domain) -> Domain:
 
 
 SINGLE = Peers()
-"""A run over a single rank."""
+"""The only part of a mesh. Its kernels order generators by position, as those of several parts do."""
 SINGLE.shared = True
 
 
