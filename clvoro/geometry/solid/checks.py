@@ -127,6 +127,12 @@ def _sides_wound(vertices: np.ndarray, triangles: np.ndarray, twin: np.ndarray) 
     return sides[0], sides[1]
 
 
+def volume_inside(corners: np.ndarray) -> float:
+    """Return the volume inside of triangles (t, 3, 3), negative if their normals point inwards."""
+    a, b, c = np.moveaxis(corners - corners.mean(axis=(0, 1)), 1, 0)
+    return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6)
+
+
 def sharp_edges(angle: np.ndarray) -> np.ndarray:
     """Return the edges whose interior or exterior dihedral angle (e,) is below 10 degrees, (k,) int."""
     return np.flatnonzero(np.minimum(angle, 2 * math.pi - angle) < math.radians(_SHARPEST))
@@ -293,8 +299,7 @@ def _turn_outwards(vertices: np.ndarray, triangles: np.ndarray, shells: list[np.
         wound[s] = 0
         depth += wound
     for shell, cavity in zip(shells, depth % 2 == 1, strict=True):
-        a, b, c = np.moveaxis(corners[shell] - corners[shell].mean(axis=(0, 1)), 1, 0)
-        if (np.einsum("ij,ij->", a, np.cross(b, c)) > 0) == cavity:
+        if (volume_inside(corners[shell]) > 0) == cavity:
             triangles[shell] = triangles[shell, ::-1]
             turned[shell] = True
     return turned

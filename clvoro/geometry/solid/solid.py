@@ -29,7 +29,7 @@ from ..surface import Surface
 from ..surface_files import SOLIDS, FilePart, joined, parts_of, read_parts, word
 from ..triangles import packed_weights, pierced
 from ..wall_triangles import WallTriangles
-from .checks import repaired, require_bounding, sharp_edges
+from .checks import repaired, require_bounding, sharp_edges, volume_inside
 from .combining import around, boolean, named_triangles
 from .creases import CONCAVE, CONVEX, connect, corner_normals, dihedral_turns, find_creases, triangle_normals
 from .stations import Stations, place_stations
@@ -200,7 +200,7 @@ class Solid(Domain):
         given = Surface(vertices, triangles, name, join)
         group = _checked_groups(name, groups, len(given))
         self.repairs: tuple[str, ...] = ()
-        given_area, given_volume = _areas(given.corners), _volume(given.corners)
+        given_area, given_volume = _areas(given.corners), volume_inside(given.corners)
         known = ["wall"] if group_names is None and groups is None else list(group_names or ())
         known += [f"group-{g}" for g in range(len(known), int(group.max()) + 1)]
         self._group_names = tuple(known)
@@ -632,7 +632,7 @@ class Solid(Domain):
 
     @cached_property
     def _volume(self) -> float:
-        return _volume(self.surface.corners)
+        return volume_inside(self.surface.corners)
 
     @property
     def boundary_measure(self) -> float:
@@ -822,12 +822,6 @@ def _from_parts(parts: list[FilePart], unit: float) -> dict[str, Any]:
     names = list(dict.fromkeys(words))
     groups = np.array([names.index(w) for w in words])[part]
     return arguments | {"groups": groups, "group_names": names}
-
-
-def _volume(corners: np.ndarray) -> float:
-    """Return the volume inside of triangles (t, 3, 3)."""
-    a, b, c = np.moveaxis(corners - corners.mean(axis=(0, 1)), 1, 0)
-    return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6)
 
 
 def _areas(corners: np.ndarray) -> np.ndarray:
