@@ -63,8 +63,8 @@ class Adapter:
     comm : mpi4py.MPI.Comm, optional
         Share runs among the ranks of this communicator: all of them create an adapter and call `run` with the same
         arguments. Each gets a `Result` of its own cells, and ``result.gather()`` returns the whole mesh on rank 0. The
-        domain is a box or a sphere; "transport", moving meshes, layers and fixed generators are refused. Without `ctx`
-        the ranks of a node take its GPUs in turn.
+        domain is a box, a polygon or a sphere; "transport", moving meshes and layers are refused. Without `ctx` the
+        ranks of a node take its GPUs in turn.
     share_gpus : bool
         Whether several ranks may have one GPU, or `devices` the same one several times. Otherwise this raises an
         `InputError`.
