@@ -222,7 +222,8 @@ class Adapter:
             if type(domain).__module__.startswith("shapely"):
                 hint = "; write clvoro.Polygon.from_shapely(domain)"
             elif isinstance(domain, str | PathLike):
-                hint = "; write clvoro.Polygon.from_geojson(domain)"
+                reader = "Polygon.from_geojson" if str(domain).lower().endswith("json") else "Solid.read"
+                hint = f"; write clvoro.{reader}(domain)"
             elif isinstance(domain, list | tuple | np.ndarray):
                 hint = "; write clvoro.Polygon(domain)"
             raise InputTypeError(

@@ -239,8 +239,8 @@ def check_number(name: str, value: object, *, above: float = -np.inf, least: flo
 
 def check_choice(name: str, value: object, choices: tuple[str, ...]) -> None:
     """Reject `value` unless it is one of `choices`."""
-    if value not in choices:
-        raise InputError(f"{name} is {value!r}, expected one of {', '.join(choices)}")
+    if not isinstance(value, str) or value not in choices:
+        raise InputError(f"{name} is {value!r:.60}, expected one of {', '.join(choices)}")
 
 
 FIRST_ROWS = "numpy.sort(numpy.unique({}, axis=0, return_index=True)[1])"

@@ -246,11 +246,11 @@ class Options:
     layers: Sequence[Layers] = ()
 
     def __post_init__(self) -> None:
-        if self.method in EFFORTS:
+        if isinstance(self.method, str) and self.method in EFFORTS:
             raise InputError(f"method is {self.method!r}, which is an effort; write effort={self.method!r}")
         check_choice("method", self.method, METHODS)
         check_choice("points", self.start, STARTS)
-        if self.effort not in EFFORTS and not isinstance(self.effort, str):
+        if not isinstance(self.effort, str):
             raise InputTypeError(
                 f"effort is {self.effort!r:.60} of type {type(self.effort).__name__}, expected one of "
                 f"{', '.join(EFFORTS)}; the size comes second and the effort third: run(domain, size, 'default')"

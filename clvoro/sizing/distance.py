@@ -78,10 +78,11 @@ class Distance(Field):
         h_max: float = math.inf,
         slope: float | None = None,
     ):
+        name = type(self).__name__
         if not isinstance(shapes, (Shape, shapely.Geometry, Iterable)):
             raise InputTypeError(
-                f"Distance got shapes {shapes!r} of type {type(shapes).__name__}, expected a shape or a list of them, "
-                "such as Distance(Circle((0.5, 0.5), 0.1), h_min=0.01, growth=1.2)"
+                f"{name} got shapes {shapes!r} of type {type(shapes).__name__}, expected a shape or a list of them, "
+                f"such as {name}(Circle((0.5, 0.5), 0.1), 0.01, growth=1.2)"
             )
         given: Any = [shapes] if isinstance(shapes, (Shape, shapely.Geometry)) else shapes
         parts = [shapes_of(s) if isinstance(s, shapely.Geometry) else [s] for s in given]
@@ -91,12 +92,12 @@ class Distance(Field):
                 bare = isinstance(shape, list | tuple | np.ndarray | Real)
                 hint = "; write Circle(p, radius=0) for a point p, Polyline(points) for a line"
                 raise InputTypeError(
-                    f"Distance got a shape of type {type(shape).__name__}, expected Circle, "
+                    f"{name} got a shape of type {type(shape).__name__}, expected Circle, "
                     "Ball, Segment, Polyline, ClosedPolyline, Edges, Surface, Box, clvoro.Polygon, clvoro.Solid, a "
                     f"curve of clvoro.curves or a geometry of shapely{hint if bare else ''}"
                 )
         if not self.shapes:
-            raise InputError("Distance got no shapes, expected at least one")
+            raise InputError(f"{name} got no shapes, expected at least one")
         self.slope = check_slope("Distance", growth, slope)
         self.h_min = check_positive("Distance h_min", h_min)
         if not (isinstance(h_max, Real) and h_max >= self.h_min):
@@ -108,7 +109,7 @@ class Distance(Field):
         parts = [s.items() for s in plain if not isinstance(s, Surface)]
         dims = {begin.shape[1] for begin, _, _ in parts} | ({3} if self.surfaces else set())
         if len(dims) > 1:
-            raise InputError("Distance got shapes of 2 and of 3 coordinates, expected one kind")
+            raise InputError(f"{name} got shapes of 2 and of 3 coordinates, expected one kind")
         self.dim = dims.pop()
         parts = parts or [(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))]
         self._begin, self._end, self._radius = (np.concatenate(p) for p in zip(*parts, strict=True))

@@ -327,7 +327,7 @@ class Raster(Field):
 
     def __repr__(self) -> str:
         shape = " x ".join(map(str, self.values.shape))
-        return f"Raster({shape}, {self.lower.tolist()}, {self.upper.tolist()})"
+        return f"{type(self).__name__}({shape}, {self.lower.tolist()}, {self.upper.tolist()})"
 
 
 class Scattered(Raster):

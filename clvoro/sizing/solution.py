@@ -282,8 +282,8 @@ class _Grid:
     ) -> _Grid:
         if lower is None or upper is None:
             raise InputError(
-                f"{what} got lower={lower} and upper={upper}, expected the corners of the box that the array covers, "
-                "or on= with the mesh on whose cells the values are"
+                f"{what} got lower={lower!r:.60} and upper={upper!r:.60}, expected the corners of the box that the "
+                f"array covers, or the mesh on whose cells the values are: write {what}(values, on=mesh)"
             )
         if growth != _GROWTH or weight is not None:
             raise InputError(

@@ -300,7 +300,7 @@ def test_combinations_and_numbers(fine):
         (lambda m: sizing.hessian_size(m.centroids[:, 0], on=m, n_cells=50), InputError, "are 0 everywhere"),
         (lambda m: sizing.hessian_size(np.ones(len(m)), on=m), InputError, "exactly one"),
         (lambda m: sizing.hessian_size(np.ones(len(m)), (0, 0), (1, 1), on=m, eps=1), InputError, "for rasters"),
-        (lambda m: sizing.hessian_size(np.ones((4, 4)), n_cells=9), InputError, "or on="),
+        (lambda m: sizing.hessian_size(np.ones((4, 4)), n_cells=9), InputError, "on=mesh"),
         (lambda m: sizing.hessian_size(np.ones((4, 4)), (0, 0), (1, 1), n_cells=9, growth=1.1), InputError, "Graded"),
         (lambda m: sizing.hessian_size([], on=m, eps=1), InputError, "a row for each"),
         (lambda m: sizing.hessian_size(m.points[:, 0], on=m, eps=1, weight=-np.ones(len(m))), InputError, "absolute"),
