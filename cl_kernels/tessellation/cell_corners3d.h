@@ -1,11 +1,11 @@
 /* A cell in 3D as the vertices of its planes: a vertex is a triple of faces, counter-clockwise seen from outside. It
-   lies in private memory; or, if a team updates it, in local memory. */
+   lies in private or global memory; or, if a team updates it, in local memory. */
 #include "tessellation/corner_shares.h"
 
 #ifdef TEAM
 #define CORNER_SPACE local
 #else
-#define CORNER_SPACE private
+#define CORNER_SPACE LANE_SPACE
 #endif
 #define CORNERS CORNER_SPACE corners_t
 #define LINKS CORNER_SPACE links_t

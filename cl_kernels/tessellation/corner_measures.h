@@ -8,7 +8,8 @@
 inline REAL4 measure_flat(const CORNERS *cell, int f, REAL4 normal, bool *wide)
 {
     /* For each vertex of the face, the faces before and after it. */
-    uchar ins[MOST_FACES], outs[MOST_FACES], at[MOST_FACES];
+    uchar ins[MOST_FACES], outs[MOST_FACES];
+    ushort at[MOST_FACES];
     int n = 0;
     for (int v = 0; v < cell->corners && n < MOST_FACES; ++v) {
         const uchar4 faces = cell->at[v];

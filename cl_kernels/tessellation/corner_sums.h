@@ -2,7 +2,7 @@
 #include "tessellation/cell_corners3d.h"
 
 /* Pad the planes to whole vectors by those of no neighbor, p = 0. */
-inline void pad_planes(corners_t *cell)
+inline void pad_planes(CORNERS *cell)
 {
     const int end = (cell->faces + WIDTH - 1) / WIDTH * WIDTH;
     for (int f = cell->faces; f < end; ++f)
@@ -14,11 +14,12 @@ typedef struct {
     REAL4 faces[MOST_FACES];
     WIDE xx[HALVES], yy[HALVES], zz[HALVES], yz[HALVES], zx[HALVES], xy[HALVES];
 } sums_t;
+#define SUMS CORNER_SPACE sums_t
 
 /* Find the vertices and sum them up. False if faces at a vertex are nearly parallel or not counter-clockwise, or a
    neighbor is very near. `reach2` and `beyond` are set. The sums are incomplete if a vertex lies beyond another face,
    or without `measured`. */
-inline bool place_corners(corners_t *cell, sums_t *sums, bool measured)
+inline bool place_corners(CORNERS *cell, SUMS *sums, bool measured)
 {
     const int blocks = (cell->corners + WIDTH - 1) / WIDTH;
     for (int v = cell->corners; v < WIDTH * blocks; ++v)
@@ -97,7 +98,7 @@ inline bool place_corners(corners_t *cell, sums_t *sums, bool measured)
 }
 
 /* Whether all vertices lie in the cell up to round-off. */
-inline bool fits_corners(const corners_t *cell)
+inline bool fits_corners(const CORNERS *cell)
 {
     WIDE beyond = cell->beyond[0];
     for (int block = 1; WIDTH * block < cell->corners; ++block)
@@ -106,7 +107,7 @@ inline bool fits_corners(const corners_t *cell)
 }
 
 /* Write the vertices as triples, with their state. */
-inline void write_triples(const corners_t *cell, global uchar4 *corners, uchar state)
+inline void write_triples(const CORNERS *cell, global uchar4 *corners, uchar state)
 {
     for (int v = 0; v < cell->corners; ++v)
         corners[v] = cell->at[v];
@@ -115,7 +116,7 @@ inline void write_triples(const corners_t *cell, global uchar4 *corners, uchar s
 
 /* Write the faces from `place` on, and the moments of the cell of generator i, from its sums. False if a face has no
    more area than round-off. */
-inline bool write_measures(const CORNERS *cell, const sums_t *sums, int i, int place, const measured_t *out)
+inline bool write_measures(const CORNERS *cell, const SUMS *sums, int i, int place, const measured_t *out)
 {
     REAL4 first = 0;
     REAL volume = 0;

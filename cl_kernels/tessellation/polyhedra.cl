@@ -229,7 +229,8 @@ kernel void clip_polyhedra(const int size, const int rows, global const REAL *bi
         row_places[i] = place;
         row_counts[i] = count;
         if (with_corners && fits) {
-            const bool whole = count == face_count && count <= MOST_FACES, clear = whole && !doubtful && !narrow;
+            const bool whole = count == face_count && count <= MOST_NUMBERED;
+            const bool clear = whole && count <= MOST_FACES && !doubtful && !narrow;
             const int unclear = whole && with_corners == UNSURE_CORNERS ? UNSURE_CORNERS : NO_CORNERS;
             if (clear || unclear)
                 write_corners(cell, corners + 2 * place);

@@ -26,7 +26,10 @@
 #define NEW_CORNERS 1    /* they are those of a new cell */
 #define KNOWN_CORNERS 2  /* they agree with those of the neighbors, and have keys; see polyhedra_update.cl */
 #define UNSURE_CORNERS 3 /* they are those of a new cell with faces near round-off */
-#define MOST_FACES 32    /* most faces of a cell with triples: one bit each */
+#ifndef MOST_FACES
+#define MOST_FACES 32 /* most faces of a cell that is updated: one bit each */
+#endif
+#define MOST_NUMBERED 256 /* most faces of a cell with triples, numbers of eight bits */
 
 /* Reserve a range in the arrays of faces. Its position depends on the order of work-items, its content does not. */
 inline int take_places(global int *report, int count)

@@ -35,6 +35,12 @@
 #define LANE_NUMBERS (WIDE)(0)
 #define HALVES 1
 #endif
+/* Rows and sums of lanes lie in private memory; or, with -DCELL_BYTES=bytes of one cell, in global memory. */
+#ifdef CELL_BYTES
+#define LANE_SPACE global
+#else
+#define LANE_SPACE private
+#endif
 /* The entry of a sum to which a block of lanes belongs. */
 #define HALF_OF(block) ((block) % HALVES)
 
@@ -54,7 +60,7 @@ inline REAL largest_lane(WIDE v)
 }
 
 /* The sum over the lanes of HALVES vectors; blocks of lanes were added to them by turns. */
-inline REAL sum_of_lanes(const WIDE *sums)
+inline REAL sum_of_lanes(LANE_SPACE const WIDE *sums)
 {
 #if WIDTH == 1
     return sums[0];
@@ -107,7 +113,7 @@ inline void add_along(places_t *c, WIDE s, const places_t *a)
 }
 
 /* Gather rows k[lane] of four numbers: the first three, and the last. */
-inline void gather_lanes(places_t *first, WIDE *last, const REAL4 *rows, const int *k)
+inline void gather_lanes(places_t *first, WIDE *last, LANE_SPACE const REAL4 *rows, const int *k)
 {
 #if WIDTH == 1
     const REAL4 row = rows[k[0]];

@@ -109,8 +109,12 @@ class CellBuilder(ABC):
         """
         t = self._tessellate(part, binned, previous, exact, part.count if rows is None else rows)
         if part.labels is not None and self.knows_corners(t):
-            part.order_rows(self.engine, t, self.defines)
+            self.order_rows(part, t)
         return t
+
+    def order_rows(self, part: Part, t: Tessellation) -> None:
+        """Sort the rows of `t`, the diagram of `part`, by its labels; see `Part.order_rows`."""
+        part.order_rows(self.engine, t, self.defines)
 
     @abstractmethod
     def _tessellate(

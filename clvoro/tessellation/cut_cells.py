@@ -19,6 +19,8 @@ KNOWN_CORNERS, UNSURE_CORNERS = 2, 3
 """States of the triples of a cell (tessellation/row_counts.h)."""
 GROWTH, MOST_FACES = 4, 512
 """Factor to the next capacity for cells with more, and the largest one."""
+MOST_NUMBERED = 256
+"""Most faces of a cell whose vertices are triples of faces (tessellation/row_counts.h)."""
 LEAST_SPACE, SPACE_PER_CELL, MOST_SPACE = 2**20, 64, 2**26
 """Bytes of global memory for cells with more than `FACE_CAPACITY` faces while they are clipped, a few at a time."""
 

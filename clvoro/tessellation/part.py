@@ -13,7 +13,7 @@ position of a neighbor take its nearest image (the PERIODIC macros).
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING
@@ -180,16 +180,19 @@ class Part:
         engine.run_each(kernel, self.n_own, np.int32(self.n_own), self.ghosts.rows, starts, neighbors, named)
         return named
 
-    def order_rows(self, engine: Engine, t: Tessellation, defines: dict[str, object]) -> None:
+    def order_rows(
+        self, engine: Engine, t: Tessellation, defines: dict[str, object], enqueue: Callable[..., object] | None = None
+    ) -> None:
         """Sort the rows of `t`, a diagram of this part, by the labels, and measure its cells and their reach again.
 
-        `defines` are those of the builder of its cells.
+        `defines` are those of the builder of its cells. `enqueue` stands for `Engine.run_each`.
         """
         given = (t.starts, t.neighbors, self.labels, t.sites, *self.box.clip_args(engine), *t.vertices[:1])
         reach = engine.scratch(t.n, np.float32) if t.reach is None else t.reach
         measures = t.face_measures, t.face_centroids, t.volumes, t.offsets, t.covariances, reach
         order = engine.kernels("tessellation/row_order", {**defines, "BY_PLACE": 1}, shared=True).order_rows
-        engine.run_each(order, t.n, *given, *measures, *(engine.period_args if t.vertices else ()))
+        enqueue = engine.run_each if enqueue is None else enqueue
+        enqueue(order, t.n, *given, *measures, *(engine.period_args if t.vertices else ()))
 
     def measure_faces(self, engine: Engine, t: Tessellation, defines: dict[str, object]) -> Tessellation:
         """Return `t`, a diagram of this part, with face measures and centroids in full precision, in new arrays."""

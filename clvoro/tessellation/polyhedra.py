@@ -23,10 +23,12 @@ from .cut_cells import (
     GROWTH,
     KNOWN_CORNERS,
     MOST_FACES,
+    MOST_NUMBERED,
     UNSURE_CORNERS,
     CutCells,
     Matching,
     capacity_defines,
+    cell_bytes,
     clip_each,
 )
 from .device_diagram import EXACT_SHARE, ROUGH_SHARE, CloseError, NeighborRows, Tessellation
@@ -75,7 +77,7 @@ class Polyhedra(CellBuilder):
         if has_lanes(engine):
             defines = {"STRETCH": STRETCH, "CUBE": CUBE, "MAX_DEPTH": MAX_LEVELS, **halo_defines(engine)}
             self._walks = engine.kernels("simd/walks", defines)
-        self._room = self._rows = 0
+        self._room, self._rows, self._has_many = 0, 0, False
         self._of_vertices: tuple[cla.Array, cla.Array] | None = None
 
     def _kernels(self, capacity: int) -> SimpleNamespace:
@@ -105,6 +107,16 @@ class Polyhedra(CellBuilder):
     def defines(self) -> dict[str, object]:
         """No macros."""
         return {}
+
+    def order_rows(self, part: Part, t: Tessellation) -> None:
+        """Sort the rows of `t` by the labels of `part`, those of cells with many faces in global memory."""
+        super().order_rows(part, t)
+        if self._has_many:
+            engine, space = self.engine, {"CELL_BYTES": cell_bytes(MOST_NUMBERED, self.engine.real)}
+            defines = {**space, "MOST_FACES": MOST_NUMBERED, "LEAST_FACES": FACE_CAPACITY + 1}
+            part.order_rows(
+                engine, t, defines, lambda kernel, size, *args: clip_each(engine, kernel, MOST_NUMBERED, size, args)
+            )
 
     def knows_corners(self, t: Tessellation) -> bool:
         """Return whether `t` has vertices: not with weights."""
@@ -187,6 +199,7 @@ class Polyhedra(CellBuilder):
             elif flags & FULL:
                 capacity = _larger(capacity)
             else:
+                self._has_many = capacity > FACE_CAPACITY
                 return replace(cut, m=m)
             # Clip only the cells that are not finished.
             again = True

@@ -136,12 +136,16 @@ def ramp(h):
 def test_the_diagram_has_the_same_bits_in_any_number_of_parts(ctx, dim, dtype, kind):
     """Clusters of very different density, so that balls reach far: ghosts are enough, or bits differ.
 
+    Between walls in 3D one cell has 60 faces: it is clipped and ordered in global memory.
     The whole of a periodic box is made anew from the generators, but its errors and qualities come from the parts. On a
     sphere most parts have generators on one side only. In a polygon each part traces the whole boundary; the whole is
     made anew, too, in one part.
     """
     rng, periodic = np.random.default_rng(70101), kind == "periodic"
     x = np.concatenate([rng.random((150, dim)), (0.3 + 0.02 * rng.standard_normal((150, dim))) % 1])
+    if dim == 3 and kind == "walls":
+        away = rng.standard_normal((60, 3))
+        x[:61] = 0.75 + np.concatenate([np.zeros((1, 3)), 0.1 * away / np.linalg.norm(away, axis=1)[:, None]])
     box = clvoro.Box((0,) * dim, (1,) * dim, periodic=(periodic, periodic, False)[:dim])
     given = {"sphere": clvoro.Sphere(2), "polygon": LAKE}.get(kind, box), 0.1
     x[:150] -= 0.5 if kind == "sphere" else 0
