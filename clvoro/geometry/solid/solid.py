@@ -454,8 +454,10 @@ class Solid(Domain):
 
     def nearest(self, points: np.ndarray) -> np.ndarray:
         """Return the nearest point of the solid to each of `points` (n, 3)."""
-        x = check_rows("points", points, 3)
-        return np.where(self.contains(x)[:, None], x, self.feet(x).point)
+        found = check_rows("points", points, 3).copy()
+        outside = ~self.contains(found)
+        found[outside] = self.feet(found[outside]).point
+        return found
 
     def onto_walls(
         self, points: np.ndarray, anchors: np.ndarray, rows: np.ndarray, sets: Sequence[tuple[int, ...]]

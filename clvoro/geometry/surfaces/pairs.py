@@ -70,8 +70,9 @@ def place_pairs(sheets: Sheets, domain: Domain, size: Callable[[np.ndarray], np.
     InputError
         If there is no room for them.
     """
-    around = _place_around_edges(sheets, domain, size)
-    sample = _Sample(sheets, domain, size, around)
+    triangles = _off_walls(sheets, domain)
+    around = _place_around_edges(sheets, triangles, domain, size)
+    sample = _Sample(sheets, triangles, domain, size, around)
     return sample.pairs()
 
 
@@ -152,8 +153,10 @@ def _angles_of_generators(sheets: np.ndarray) -> tuple[np.ndarray, float]:
     return np.concatenate(found), reach
 
 
-def _place_around_edges(sheets: Sheets, domain: Domain, size: Callable[[np.ndarray], np.ndarray]) -> AroundCreases:
-    triangles = _off_walls(sheets, domain)
+def _place_around_edges(
+    sheets: Sheets, triangles: NearestTriangles, domain: Domain, size: Callable[[np.ndarray], np.ndarray]
+) -> AroundCreases:
+    """Return the generators around edges; `triangles` are those of `sheets` that do not lie on walls."""
 
     def depth(x: np.ndarray) -> np.ndarray:
         inside = domain.contains(x)
@@ -189,13 +192,12 @@ def _inside(domain: Domain, points: np.ndarray) -> np.ndarray:
 
 def _off_walls(sheets: Sheets, domain: Domain) -> NearestTriangles:
     """Return the triangles that do not lie on walls."""
-    corners = sheets.surface.corners
-    points = np.concatenate([corners, corners.mean(axis=1, keepdims=True)], axis=1)
-    away = domain.boundary_distance(points.reshape(-1, 3)).reshape(-1, 4).max(axis=1)
-    off = np.flatnonzero(away > _ON_WALL * float(domain.extent.max()))
-    if not len(off):
+    surface, most = sheets.surface, _ON_WALL * float(domain.extent.max())
+    on = (domain.boundary_distance(surface.vertices) <= most)[surface.triangles].all(axis=1)
+    on[on] = domain.boundary_distance(surface.corners[on].mean(axis=1)) <= most
+    if on.all():
         raise InputError("surfaces are on the walls of the domain, expected a part of one inside; leave them out")
-    return NearestTriangles(sheets.surface, off)
+    return NearestTriangles(surface, np.flatnonzero(~on))
 
 
 def _no_room(place: np.ndarray, size: Callable[[np.ndarray], np.ndarray], why: str) -> InputError:
@@ -291,9 +293,14 @@ class _Sample:
     """
 
     def __init__(
-        self, sheets: Sheets, domain: Domain, size: Callable[[np.ndarray], np.ndarray], around: AroundCreases
+        self,
+        sheets: Sheets,
+        triangles: NearestTriangles,
+        domain: Domain,
+        size: Callable[[np.ndarray], np.ndarray],
+        around: AroundCreases,
     ) -> None:
-        self.sheets, self.domain, self.size = sheets, domain, size
+        self.sheets, self.triangles, self.domain, self.size = sheets, triangles, domain, size
         self.points, self.heights = [*around.points], [*around.sizes / 2]
         self.balls = [list(balls) for balls in around.balls]
         self.centers, self.radii = [*around.centers], [_CLEAR * r for r in around.radii]
@@ -409,7 +416,7 @@ class _Sample:
         if not wide.all():
             place = x[~wide][0]
             raise _no_room(place, self.size, "a wall is too near")
-        close = np.flatnonzero(_off_walls(self.sheets, self.domain).feet(x, math.inf).distance < _STRAIGHT * height)
+        close = np.flatnonzero(self.triangles.feet(x, math.inf).distance < _STRAIGHT * height)
         close = close[close >= self.fold]
         if len(close):
             raise _no_room(x[close[0]], self.size, "surfaces are too near to each other, or too curved")
