@@ -18,7 +18,7 @@ LEAST_BULGE = 0.1
 FILLED = 0.5
 """Share of the triangle of a corner and the ends of the side that must lie in the domain, or it is cut off."""
 LEAST_AREA = 1e-3
-"""What straight sides must enclose of the area of a cell, or it keeps its own sides, as in the kernel `trim`."""
+"""What straight sides must enclose of the area of a cell, or it keeps its own sides."""
 
 
 def count_sides(diagram: Diagram) -> np.ndarray:

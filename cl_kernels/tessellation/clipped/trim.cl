@@ -428,7 +428,7 @@ kernel void write_trimmed(const int size, const int straight, SEGMENT_ARGS, SHOR
             add_wall_sides(&o, &shore, chord, i, points[i], cell_size);
     }
     /* Two sides do not form a polygon, even if one is bent, nor do straight sides that enclose next to nothing. */
-    const bool is_polygon = o.sides > 2 && o.m.area > LEAST_AREA * m.area;
+    const bool is_polygon = o.sides > 2 && o.m.area > R(LEAST_AREA) * m.area;
     write_moments(straight && is_polygon ? &o.m : &m, i, volumes, offsets, covariances);
     const REAL quality =
         is_polygon ? polygon_quality(o.sides, o.m.area / 2, o.perimeter) : polygon_quality(3, m.area / 2, perimeter);

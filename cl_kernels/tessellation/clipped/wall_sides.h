@@ -17,10 +17,10 @@ typedef struct {
     moments_t m;
 } outline_t;
 
-#define LEAST_BULGE R(0.1) /* distance of a corner from the side, over the size of the cell */
-#define FILLED R(0.5)      /* share of its triangle that lies in the domain */
-#define LEAST_AREA R(1e-3) /* what straight sides must enclose of the area of a cell */
-#define MOST_PARTS 16      /* parts of a run that wait to be divided */
+#ifndef LEAST_BULGE
+#error "build with -DLEAST_BULGE, FILLED and LEAST_AREA of straightening.py"
+#endif
+#define MOST_PARTS 16 /* parts of a run that wait to be divided */
 
 /* The boundary of the cells of a clipped diagram.
 
@@ -112,7 +112,7 @@ inline int2 corner_between(const shore_t *s, int first, int last, REAL2 x, REAL 
     }
     const REAL2 u = chord_begin(&s->c, last) - x - p;
     area += difference_of_products(u.s0, side.s1, u.s1, side.s0);
-    const bool is_corner = length > 0 && farthest >= LEAST_BULGE * size * length && area >= FILLED * farthest;
+    const bool is_corner = length > 0 && farthest >= R(LEAST_BULGE) * size * length && area >= R(FILLED) * farthest;
     return is_corner ? found : (int2)(-1);
 }
 

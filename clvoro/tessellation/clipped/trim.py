@@ -8,6 +8,7 @@ import numpy as np
 import pyopencl.array as cla
 
 from ...geometry.polygon import Polygon
+from ...mesh.straightening import FILLED, LEAST_AREA, LEAST_BULGE
 from ...opencl.device_array import read_number
 from ...opencl.engine import Engine
 from ...opencl.primitives import NamedArrays, Scan
@@ -60,7 +61,8 @@ class Trim:
         self.engine = engine
         # Sizes change little from step to step.
         self._scan, self._room = Scan(engine), NamedArrays(engine, spare=1 / 16)
-        self._kernels = engine.kernels("tessellation/clipped/trim", order_defines(engine))
+        limits = {"LEAST_BULGE": LEAST_BULGE, "FILLED": FILLED, "LEAST_AREA": LEAST_AREA}
+        self._kernels = engine.kernels("tessellation/clipped/trim", {**limits, **order_defines(engine)})
         # Flags of kernels, and the number of segments: the host reads both at once.
         self._flags = engine.empty(2, np.int32)
 
