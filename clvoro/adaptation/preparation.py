@@ -17,7 +17,7 @@ from ..geometry.gaps import NARROW
 from ..sizing import Sizing, as_field
 from ..sizing.field import on_domain
 from .diagnostics import check_precision, warn_of_narrow_parts
-from .estimates import SAMPLE, Extras, check_memory, expected_images, expected_surplus, holder_of_all
+from .estimates import SAMPLE, Extras, check_memory, check_prisms, expected_images, expected_surplus, holder_of_all
 from .fixed_points import check_beside_borders, check_room, place_in_corners
 from .layers import Layout, lay_out
 from .methods import MOVING, Relaxation, make_method
@@ -75,7 +75,7 @@ class Prepared:
         if self.points is None:
             return None
         own = np.arange(len(self.points)) if self.kept_rows is None else self.kept_rows
-        return np.concatenate([np.full(len(self.layout.rows), -1), own]).astype(np.int32)
+        return np.concatenate([np.full(len(self.layout.layers.points), -1), own]).astype(np.int32)
 
 
 class Beginning(NamedTuple):
@@ -121,11 +121,11 @@ def prepare(stages: Stages, arguments: RunArguments, max_levels: int | None = No
     count = _count(layout, sizing, points, options)
     setup = _set_up(stages, layout, sizing, count, fixed, options)
     lattice = lattice_points(domain, count.target) if options.method in MOVING else None
-    levels = _count_levels(setup, points, count.target, len(layout.rows), options) if options.multilevel else 0
+    levels = _count_levels(setup, points, count.target, len(layout.layers.points), options) if options.multilevel else 0
     if options.levels == "auto" and max_levels is not None:
         levels = min(levels, max_levels)
     most = max(count.target, 0 if points is None else len(points))
-    layout.check_prisms(lambda x: count.factor * sizing(x))
+    check_prisms(layout.layers.prisms(lambda x: count.factor * sizing(x)))
     memory = _estimate_memory(setup, options, count, most, levels)
     return Prepared(options, setup, points, layout, count, lattice, levels, kept_rows, memory)
 
@@ -134,7 +134,7 @@ def _set_up(
     stages: Stages, layout: Layout, sizing: Sizing, count: CellCount, fixed: np.ndarray, options: Options
 ) -> Setup:
     """Return what all levels have in common: the generators that do not move, and the factors on the size field."""
-    domain, free, rows = layout.domain, layout.free, layout.rows
+    domain, free, rows = layout.domain, layout.layers.free, layout.layers.points
     if len(fixed):
         check_room(fixed, domain, free, rows, count.factor * sizing(fixed))
     own = 1.0
@@ -152,7 +152,7 @@ def _place_around(
     layout: Layout, fixed: np.ndarray, size: Callable[[np.ndarray], np.ndarray], count: CellCount
 ) -> FixedGenerators | None:
     """Return generators beside borders, and, if the others are random, in corners and creases, if there are any."""
-    domain, free, rows, drawn = layout.domain, layout.free, layout.rows, count.tree is not None
+    domain, free, rows, drawn = layout.domain, layout.layers.free, layout.layers.points, count.tree is not None
     if domain.borders is None:
         return place_in_corners(domain, free, fixed, rows, size, count.target) if drawn else None
     around = domain.borders.place(domain, free, size)
@@ -220,8 +220,8 @@ def _count(layout: Layout, sizing: Sizing, points: np.ndarray | None, options: O
     domain, n_cells = layout.domain, options.n_cells
     # The other methods keep the number of given points.
     kept = points is not None and not options.multilevel
-    tree = None if kept else density_tree(sizing, layout.free)
-    required = float(len(points)) if points is not None and tree is None else tree.integral + len(layout.rows)  # type: ignore[union-attr]
+    tree = None if kept else density_tree(sizing, layout.layers.free)
+    required = float(len(points)) if points is not None and tree is None else tree.integral + len(layout.layers.points)  # type: ignore[union-attr]
     layout.warn_of_mismatches()
     target = n_cells if n_cells is not None else max(1, round(required))
     _check_sizes(domain, sizing, tree, required, target, options)
@@ -341,8 +341,8 @@ def start(prepared: Prepared) -> MeshState:
     if host is None:
         host = _sample(prepared)
     check_precision(setup.sizing, domain, host, setup.factor)
-    if len(layout.rows):
-        host = np.concatenate([layout.rows, host[layout.beyond(host)]])
+    if len(layout.layers.points):
+        host = np.concatenate([layout.layers.points, host[layout.beyond(host)]])
     placed = domain.place(host, engine.real)
     labels = np.arange(setup.first_row, setup.first_row + len(host), dtype=np.int32)
     taken = np.full(len(fixed), -1, np.int32)
@@ -371,8 +371,8 @@ def _sample(prepared: Prepared) -> np.ndarray:
 def _cells_at_start(prepared: Prepared) -> int:
     """Return the number of cells of the coarsest level, without those of layers."""
     layout, levels = prepared.layout, prepared.levels
-    cells = (prepared.count.target - len(layout.rows)) / 2 ** (layout.domain.cell_dim * levels)
-    return max(layout.free.least_cells(levels > 0), round(cells))
+    cells = (prepared.count.target - len(layout.layers.points)) / 2 ** (layout.domain.cell_dim * levels)
+    return max(layout.layers.free.least_cells(levels > 0), round(cells))
 
 
 def without_far(prepared: Prepared, max_levels: int | None = None) -> Prepared:
@@ -391,7 +391,7 @@ def without_far(prepared: Prepared, max_levels: int | None = None) -> Prepared:
     if len(rows):
         new = np.full(len(points) - len(rows), -1)
         return replace(prepared, points=points, kept_rows=np.concatenate([before[rows], new]))
-    levels = _count_levels(setup, None, prepared.count.target, len(prepared.layout.rows), options)
+    levels = _count_levels(setup, None, prepared.count.target, len(prepared.layout.layers.points), options)
     levels = levels if max_levels is None else min(levels, max_levels)
     # Points are drawn for the coarsest level from the tree as it was.
     tree = density_tree(setup.sizing, setup.free)

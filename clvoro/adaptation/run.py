@@ -209,7 +209,8 @@ class Run:
             "fixed": len(self.arguments.fixed),
         }
         used = {name: value for name, value in settings.items() if uses(options.method, name)}
-        used |= {"widths": widths} if (widths := prepared.layout.narrow_layers) else {}
+        layout = prepared.layout
+        used |= {"widths": widths} if (widths := layout.layers.narrow(layout.given)) else {}
         used |= {"path": self.beginning.why} if self.beginning.why else {}
         return {**used, "trade": planned.trade} if options.multilevel else used
 

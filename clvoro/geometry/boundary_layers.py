@@ -23,6 +23,8 @@ if TYPE_CHECKING:
     from .solid.solid import Solid
     from .surface import Surface
 
+Size = Callable[[np.ndarray], np.ndarray]
+"""Target sizes at points (n, d)."""
 _NEAR = 0.6  # of a cell: of two generators that are nearer to each other than this, one is dropped
 _SHORT = 1e-9  # of the domain: shorter edges of the region beyond the layers are dropped
 _APART = 0.3  # of a width, between the last row and the generators that move
@@ -37,6 +39,16 @@ INNER_DEPTH, DEEPER = 2.0, 8.0
 """Vertices move with a wall that gets layers if they are nearer to it than INNER_DEPTH h + DEEPER thickness."""
 OF_GAP = 0.15
 """Share of the distance to the opposite wall that layers of prisms fill."""
+COARSER, FINER = 2.0, 1e-3
+"""Size of the cells of layers over the size field above which a run warns, and their default width over it below which
+it warns."""
+THICKEST, FLATTEST, THINNEST = 3.0, 1000.0, 0.02
+"""Limits of layers of prisms beyond which a run warns: largest thickness of all layers over the size field, largest
+size field over the height of the first layer, and least height of the last layer over the size field."""
+NARROWER = 0.8
+"""Default width of layers over the size field below which the settings of the result say so."""
+SAMPLE = 64
+"""Largest number of points along a layer at which its sizes are compared with the size field."""
 _OWN = 0.9  # of its distance from its wall: a generator that is nearer to another wall than this is dropped
 
 
@@ -150,7 +162,52 @@ def _numbers_or_names(edges: object) -> tuple[int | str, ...]:
     return tuple(e if isinstance(e, str) else check_integer("Layers edges", e, 0) for e in items)
 
 
-class LayerRows:
+class PlacedLayers:
+    """The layers of a domain: rows of generators in 2D, prisms in a solid. This one has none.
+
+    Parameters
+    ----------
+    domain : Domain
+    """
+
+    points: np.ndarray
+    """(n, d) float. Generators of layers, which do not move. Layers of prisms have none."""
+    free: Domain
+    """Where other generators move."""
+    layers: Sequence[Layers] = ()
+    compress = False
+    """Whether they compress other cells, after a run."""
+
+    def __init__(self, domain: Domain) -> None:
+        self.free, self.points = domain, np.empty((0, domain.dim))
+
+    def beyond(self, points: np.ndarray) -> np.ndarray:
+        """Return which of `points` (n, d) are beyond the layers, (n,) bool."""
+        return np.ones(len(points), bool)
+
+    def prisms(self, size: Size) -> float:
+        """Return an estimate of the number of prisms, for wall polygons as wide as the size field."""
+        del size
+        return 0.0
+
+    def narrow(self, size: Size) -> str:
+        """Return where the default width of layers is smaller than the size field, in words; empty if nowhere."""
+        del size
+        return ""
+
+    def mismatches(self, size: Size) -> list[str]:
+        """Return warnings for cells of layers that have a very different size than the field there.
+
+        Layers are usually finer than the field across the wall. But their width along the wall, if it is not given, can
+        be far too small.
+        """
+        return [text for k in range(len(self.layers)) if (text := self._mismatch(k, size))]
+
+    def _mismatch(self, k: int, size: Size) -> str:
+        raise NotImplementedError
+
+
+class LayerRows(PlacedLayers):
     """Layers along walls in 2D: rows of generators that do not move, in columns normal to the walls.
 
     Parameters
@@ -327,7 +384,7 @@ class LayerRows:
         return inner
 
     def beyond(self, points: np.ndarray) -> np.ndarray:
-        """Return which of `points` (n, 2) lie in the `free` domain and differ from the generators, (n,) bool."""
+        """Return which of `points` (n, 2) are in the `free` domain, and are no generators of layers, (n,) bool."""
         return np.asarray(self.free.contains(points) & (scipy.spatial.KDTree(self.points).query(points)[0] > 0))
 
     def check_gaps(self) -> None:
@@ -361,8 +418,42 @@ class LayerRows:
                 f"thickness of at most {fits:.3g}; use fewer or thinner layers, or leave out these edges"
             )
 
+    def narrow(self, size: Size) -> str:
+        """See `PlacedLayers.narrow`."""
+        found = []
+        for k, layer in enumerate(self.layers):
+            if layer.spacing is None:
+                h = self._size_along(k, layer.count, size)
+                if layer.width < NARROWER * h:
+                    found.append(
+                        f"layers[{k}] have cells {layer.width:.3g} wide, the last layer's height, where the size field "
+                        f"is {h:.3g}: give spacing for others"
+                    )
+        return "; ".join(found)
 
-class LayerPrisms:
+    def _mismatch(self, k: int, size: Size) -> str:
+        layer = self.layers[k]
+        for row in sorted({0, layer.count - 1}):
+            h, height = self._size_along(k, row, size), float(layer.heights[row])
+            what = f"layers[{k}] has cells {layer.width:.3g} wide and {height:.3g} high where the size field is {h:.3g}"
+            if np.sqrt(layer.width * height) > COARSER * h:
+                return f"{what}: sizes jump there; make the layers finer or the size field larger along these walls"
+            if row == layer.count - 1 and layer.spacing is None and layer.width < FINER * h:
+                return (
+                    f"{what}: their width is the last layer's height, because no spacing is given; do layers and size "
+                    "field have the same unit? Otherwise give spacing, the width along the wall"
+                )
+        return ""
+
+    def _size_along(self, k: int, row: int, size: Size) -> float:
+        """Return the median size along row `row` of layer `k`; nan if that is outside of the domain."""
+        feet, normals = self.columns(k)
+        places = (feet + self.layers[k].rows[row] * normals)[:: -(-len(feet) // SAMPLE)]
+        places = places[self.domain.contains(places)]
+        return float(np.median(size(places))) if len(places) else np.nan
+
+
+class LayerPrisms(PlacedLayers):
     """Layers along walls of a solid: prisms over the polygons on the walls, in the mesh for solvers.
 
     Parameters
@@ -377,10 +468,11 @@ class LayerPrisms:
         patches that meet have layers of different count.
     """
 
+    free: Solid
+    compress = True
+
     def __init__(self, solid: Domain, layers: Sequence[Layers]) -> None:
-        self.layers, self.free = layers, cast("Solid", solid)
-        self.points = np.empty((0, 3))
-        """As `LayerRows` have them."""
+        self.layers, self.free, self.points = layers, cast("Solid", solid), np.empty((0, 3))
         boundaries = solid.boundaries
         self._chosen = [boundaries.select("Layers edges", layer.edges) for layer in layers]
         names = [solid.boundary_names[k] for k in solid.boundary_index]
@@ -416,12 +508,12 @@ class LayerPrisms:
         """The walls that have each of the layers."""
         return [cast("Surface", self.free.boundary(layer.edges)) for layer in self.layers]
 
-    def sample(self, k: int, size: Callable[[np.ndarray], np.ndarray], most: int) -> np.ndarray:
+    def sample(self, k: int, size: Size, most: int) -> np.ndarray:
         """Return `size` at up to `most` points on the walls of layer `k`, (m,) float."""
         return np.asarray(size(self.walls[k].landmarks(float(self.free.extent.min()) / 8, most)), float)
 
-    def count(self, size: Callable[[np.ndarray], np.ndarray]) -> float:
-        """Return an estimate of the number of prisms, for wall polygons as wide as the size field, `size(points)`."""
+    def prisms(self, size: Size) -> float:
+        """See `PlacedLayers.prisms`."""
         total = 0.0
         for k, layer in enumerate(self.layers):
             h, edges = self.sample(k, size, _SAMPLE), np.diff(self.walls[k].corners, axis=1).swapaxes(0, 1)
@@ -454,6 +546,27 @@ class LayerPrisms:
         for walls, layer in zip(self.walls, self.layers, strict=True):
             beyond &= walls.distance2(points) > layer.thickness**2
         return beyond
+
+    def _mismatch(self, k: int, size: Size) -> str:
+        layer, h = self.layers[k], self.sample(k, size, SAMPLE)
+        smallest, largest = float(h.min()), float(h.max())
+        if layer.thickness > THICKEST * smallest:
+            return (
+                f"layers[{k}] are {layer.thickness:.3g} thick where the size field is {smallest:.3g}, expected at most "
+                f"{THICKEST:g} times as much, as all cells beside them are compressed; use fewer or thinner layers"
+            )
+        if largest > FLATTEST * layer.height:
+            return (
+                f"layers[{k}] have a first height of {layer.height:.3g} where the size field is {largest:.3g}: "
+                f"OpenFOAM's checkMesh rejects cells more than {FLATTEST:g} times as wide as high; use a larger "
+                "height, or smaller sizes there"
+            )
+        if layer.heights[-1] < THINNEST * smallest:
+            return (
+                f"the last of layers[{k}] is {layer.heights[-1]:.3g} high beside cells of {smallest:.3g}, where sizes "
+                "jump; use more layers, or a larger growth"
+            )
+        return ""
 
 
 def _as_polygon(domain: Domain) -> tuple[Polygon, np.ndarray]:

@@ -12,7 +12,6 @@ import shapely
 import clvoro
 from clvoro import sizing
 from clvoro.adaptation.diagnostics import warn_of_narrow_parts
-from clvoro.adaptation.layers import layer_mismatches
 from clvoro.cli import command as cli
 from clvoro.errors import CoarseSizeWarning, MismatchWarning, SizeErrorWarning
 from clvoro.geometry.boundary_layers import LayerRows
@@ -175,7 +174,7 @@ def test_warnings_of_layers(layer, size, message, domain):
     # The field is coarse far away: what counts is beside the layers.
     field = sizing.Distance(sizing.Segment((0, 0), (2, 0)), h_min=size, slope=0.05)
     edges = (2,) if domain is BOX else (0,)
-    found = layer_mismatches(LayerRows(domain, [clvoro.Layers(**layer, edges=edges)]), field)
+    found = LayerRows(domain, [clvoro.Layers(**layer, edges=edges)]).mismatches(field)
     assert len(found) == (message is not None)
     assert message is None or message in found[0]
 
