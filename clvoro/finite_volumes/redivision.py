@@ -31,17 +31,15 @@ BESIDE = 0.05
 """Displacement of a new point on a face, over its length: away from the cell beyond, which stays convex."""
 LEAST_SHARE = 0.15
 """Least area of each half of a cut polygon, as a share of the whole."""
-FLAT, MOST_FILLED = 1e-3, (0.1, 1.0)
+FLAT, MOST_FILLED = 1e-3, 0.1
 """Largest turn to the left, in radians, of a wall that is made straight. Largest area that a polygon gains there, over
-its own: 1.0 is for cells that no cut with 0.1 helps."""
+its own."""
 MOVED = (1e-3, 0.02, 0.1)
 """Where corners go in which a cell is not convex: beyond the line between their neighbors, as shares of its length."""
 SHARPEST = 0.1
 """Least sine of the angles between a cut and the sides on which it ends."""
 TRIED = 24
 """Largest number of cuts of one polygon whose measures are computed: those with the roundest halves."""
-RINGS = 2
-"""Rings of cells, around the two that are divided, whose faces are computed. Scores leave out the outermost ring."""
 FAR = 10
 """Number of nearest cells of which one may be cut for a rejected cell, if cuts of its neighbors do not help."""
 ROUNDS = 16
@@ -151,14 +149,13 @@ class _Edit:
     def change(self, cell: int) -> None:
         """Divide `cell` and another one anew, if that helps: a neighbor, or else one of the nearest cells."""
         near = sorted({side[2] for side in self.sides_of(cell) if side[2] >= 0} - {cell})
-        for most in MOST_FILLED:
-            if any(self._try(cell, near, partial(self._divided, most, union)) for union in (True, False)):
-                return
+        if any(self._try(cell, near, partial(self._divided, union)) for union in (True, False)):
+            return
         if self._try(cell, near[:1], self._moved):
             return
         order = np.argsort(((self.old.generators - self.old.generators[cell]) ** 2).sum(axis=1), kind="stable")
         far = [c for c in order[1:FAR].tolist() if c not in near]
-        self._try(cell, far, partial(self._divided, MOST_FILLED[-1], False))
+        self._try(cell, far, partial(self._divided, False))
 
     def _try(self, cell: int, others: list[int], changes: Callable[[int, int, Loops], list[_Change]]) -> bool:
         """Make the best change of a cell and one of `others` if it leaves fewer bad cells; return whether it does.
@@ -168,9 +165,9 @@ class _Edit:
         """
         best: tuple[tuple[int, float], _Change] | None = None
         for other in others:
-            local, judged = self._around(cell, other)
+            local = self._around(cell, other)
             made = [_Change(local, {}), *changes(cell, other, local)]
-            (count, _), *scores = self._scores(made, judged)
+            (count, _), *scores = self._scores(made, [cell, other])
             for (left, worst), change in zip(scores, made[1:], strict=True):
                 if left < count and (best is None or (left - count, worst) < best[0]):
                     best = (left - count, worst), change
@@ -188,13 +185,13 @@ class _Edit:
                 self.changed[c] = [(place.get(a, a), place.get(b, b), other) for a, b, other in loop]
         return True
 
-    def _divided(self, most: float, union: bool, cell: int, other: int, local: Loops) -> list[_Change]:
+    def _divided(self, union: bool, cell: int, other: int, local: Loops) -> list[_Change]:
         """Return the cells `local` after each cut of the `union` of two cells, or of the other one alone.
 
-        Then walls take the place of `cell`. `most` is one of `MOST_FILLED`.
+        Then walls take the place of `cell`.
         """
         outline, walled = (self._union(cell, other), {}) if union else self._without(cell, other, local)
-        cuts = self._cuts(self._straightened(outline, most)) if len(outline) > 2 else []
+        cuts = self._cuts(self._straightened(outline)) if len(outline) > 2 else []
         return [self._changed(cell, other, cut, {**local, **walled}) for cut in cuts]
 
     def _moved(self, cell: int, other: int, local: Loops) -> list[_Change]:
@@ -212,14 +209,10 @@ class _Edit:
             found += [_Change(local, new)] if new else []
         return found
 
-    def _around(self, *cells: int) -> tuple[Loops, list[int]]:
-        """Return the sides of `cells` and of `RINGS` around them, and the cells without those of the outermost ring."""
-        around, known = [list(cells)], set(cells)
-        for _ in range(RINGS):
-            near = sorted({side[2] for c in around[-1] for side in self.sides_of(c) if side[2] >= 0} - known)
-            around.append(near)
-            known.update(near)
-        return {c: self.sides_of(c) for c in sorted(known)}, [c for ring in around[:-1] for c in ring]
+    def _around(self, cell: int, other: int) -> Loops:
+        """Return the sides of two cells and of their neighbors."""
+        near = {side[2] for c in (cell, other) for side in self.sides_of(c) if side[2] >= 0}
+        return {c: self.sides_of(c) for c in sorted(near | {cell, other})}
 
     def _union(self, cell: int, other: int) -> list[Side]:
         """Return the sides of the union of two cells; empty if it is no simple polygon."""
@@ -271,14 +264,14 @@ class _Edit:
                     a = ahead[a][1]
         return _Change(made, cut.points)
 
-    def _straightened(self, outline: list[Side], most: float) -> list[Side]:
+    def _straightened(self, outline: list[Side]) -> list[Side]:
         """Return a polygon without points between two walls where it is flat or not convex; see `MOST_FILLED`.
 
         Points stay where the named part changes.
         """
         found, k = list(outline), 0
         x = np.array([self.points[side[0]] for side in outline])
-        most *= np.abs(cross(x - x[0], np.roll(x, -1, axis=0) - x[0]).sum())
+        most = MOST_FILLED * np.abs(cross(x - x[0], np.roll(x, -1, axis=0) - x[0]).sum())
         while k < len(found) and len(found) > 3:
             (a, b, wall), (_, d, after) = found[k - 1], found[k]
             u, v = self.points[b] - self.points[a], self.points[d] - self.points[b]
