@@ -1,4 +1,4 @@
-"""Meshes on spheres from netCDF files by MPAS, UGRID and SCRIP."""
+"""Meshes on spheres from netCDF files by MPAS and UGRID."""
 
 from __future__ import annotations
 
@@ -273,34 +273,7 @@ def read_ugrid(file: Variables) -> MeshInFile | None:
     return MeshInFile(radius, points, vertices, counts, corners, of_run=of_cells)  # type: ignore[arg-type]
 
 
-def read_scrip(file: Variables) -> MeshInFile | None:
-    """Return the cells of a file by SCRIP of clvoro; None for other files.
-
-    SCRIP has the corners of each cell on their own. Those at the same place are one.
-    """
-    if "grid_corner_lon" not in file:
-        return None
-    if "generator_lon" not in file:
-        raise FileError(
-            "it has centers and corners, and SCRIP has no generators; pass the centers to clvoro.voronoi for the mesh "
-            "around them"
-        )
-    radius = _radius(file)
-    sphere = Sphere(radius)
-    around = file.real("grid_corner_lon", "grid_corner_lat")
-    n, most = around.shape[:2]
-    around = around.reshape(-1, 2)
-    around[:, 0] = np.where(np.abs(around[:, 1]) == 90, 0, np.mod(around[:, 0], 360))
-    lonlat, place = np.unique(around, axis=0, return_inverse=True)
-    table = place.reshape(n, most)
-    # Cells of fewer corners repeat the last one.
-    counts = 1 + (table != table[:, -1:]).sum(axis=1)
-    corners = table[np.arange(most) < counts[:, None]]
-    points = sphere.positions(file.real("generator_lon", "generator_lat"))
-    return MeshInFile(radius, points, sphere.positions(lonlat), counts, corners)
-
-
-READERS: tuple[Callable[[Variables], MeshInFile | None], ...] = (read_mpas, read_ugrid, read_scrip)
+READERS: tuple[Callable[[Variables], MeshInFile | None], ...] = (read_mpas, read_ugrid)
 
 
 def _ragged(table: np.ndarray, counts: np.ndarray, bound: int, first: int, name: str) -> np.ndarray:
@@ -368,7 +341,7 @@ def open_netcdf(path: str | PathLike[str]) -> Iterator[Variables]:
 
 
 def load_netcdf(path: str | PathLike[str]) -> Result | Diagram:
-    """Read the cells of a mesh on a sphere from a file by the MPAS mesh specification, UGRID or SCRIP.
+    """Read the cells of a mesh on a sphere from a file by the MPAS mesh specification or UGRID.
 
     Neighbors, areas, arcs and centroids are computed from generators and corners. A UGRID file of a `Result` gives a
     `Result`; others give a `Diagram`.
@@ -387,4 +360,4 @@ def _read(file: Variables) -> MeshInFile:
         cells = reader(file)
         if cells is not None:
             return cells
-    raise FileError("it has no mesh by MPAS, UGRID or SCRIP")
+    raise FileError("it has no mesh by MPAS or UGRID")

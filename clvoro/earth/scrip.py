@@ -1,8 +1,7 @@
 """Write meshes on a sphere by the SCRIP conventions, for tools that remap data between grids (ESMF, NCO, TempestRemap).
 
 See Jones (1998), A user's guide for SCRIP. Longitudes and latitudes are in degrees, areas in steradians. The corners of
-cells are counter-clockwise; cells of fewer corners repeat the last one. Generators, which SCRIP does not have, and the
-radius are there for `clvoro.load`.
+cells are counter-clockwise; cells of fewer corners repeat the last one.
 """
 
 from __future__ import annotations
@@ -29,7 +28,7 @@ def write_scrip(contents: Contents, path: Path, unit: str = "m") -> None:
         path,
         contents,
         {"grid_size": n, "grid_corners": most, "grid_rank": 1},
-        {"title": "Voronoi cells", "Conventions": "SCRIP", "sphere_radius": np.float64(globe.radius)},
+        {"title": "Voronoi cells", "Conventions": "SCRIP"},
     )
     file.add("grid_dims", ("grid_rank",), np.array([n], np.int32))
     file.add("grid_imask", ("grid_size",), np.ones(n, np.int32), units="unitless")
@@ -38,9 +37,6 @@ def write_scrip(contents: Contents, path: Path, unit: str = "m") -> None:
         file.add(f"grid_center_{name}", ("grid_size",), centers[:, column], units="degrees")
         shape = ("grid_size", "grid_corners")
         file.add(f"grid_corner_{name}", shape, around[table, column], units="degrees")
-    generators = globe.lonlat(diagram.points)
-    for column, name in enumerate(("lon", "lat")):
-        file.add(f"generator_{name}", ("grid_size",), generators[:, column], units="degrees")
     areas = diagram.volumes / globe.radius**2
     file.add("grid_area", ("grid_size",), areas, units="radians^2", long_name="area of a cell")
     file.add_extra("grid_size")

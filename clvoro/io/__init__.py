@@ -50,8 +50,7 @@ def load(path: str | PathLike[str]) -> Result | Diagram:
     A ``.nc`` file of a mesh on a sphere may also be of another program. Generators, cells, neighbors and the generators
     behind a boundary are those that were saved, up to round-off; the boundary has one name, and corners may have other
     numbers. Files by the MPAS mesh specification have no sizes, errors and quality. UGRID files have longitudes and
-    latitudes of generators (the coordinates of faces); those of clvoro have sizes, errors and quality, too. SCRIP files
-    have corners, and only those of clvoro have generators.
+    latitudes of generators (the coordinates of faces); those of clvoro have sizes, errors and quality, too.
 
     Parameters
     ----------
