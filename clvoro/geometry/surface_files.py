@@ -21,6 +21,7 @@ _OPTIONS: dict[str, dict[str, Any]] = {
     "obj": {"skip_materials": True, "split_groups": True, "split_objects": True, "group_material": False}
 }
 _TURNS = 32  # triangles around a circle of a STEP file
+_UNNAMED = "Open CASCADE STEP translator"  # so begin the names that Open CASCADE gives shapes without one
 
 
 class FilePart(NamedTuple):
@@ -145,7 +146,7 @@ def _read_step(path: Path) -> list[FilePart]:
                 name = gmsh.model.getEntityName(2, abs(face)).rpartition("/")[2]
                 nodes = np.asarray(gmsh.model.mesh.getElementsByType(2, abs(face))[1])
                 triangles = place[nodes.astype(np.int64)].reshape(-1, 3)
-                found.setdefault(name, []).append(triangles)
+                found.setdefault("" if name.startswith(_UNNAMED) else name, []).append(triangles)
     except Exception as error:  # Gmsh raises plain exceptions
         raise InputError(f"{str(path)!r} cannot be read as STEP ({error}); export it again, or as STL") from error
     finally:

@@ -10,7 +10,8 @@ try:
 except ModuleNotFoundError as error:
     raise ClvoroError("pictures need Matplotlib, which is not installed; pip install 'clvoro[plot]'") from error
 
-from .cells import plot_boundaries, plot_cells, plot_size
+from .boundaries import plot_boundaries
+from .cells import plot_cells, plot_size
 from .curves import plot_distributions, plot_history
 from .globe import map_projection, plot_globe
 from .page import write_report

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -23,10 +23,7 @@ from ..mesh.diagram import Diagram
 from ..mesh.results import Result
 from .colors import COLORINGS, Color, Paint, paint_of, picture_of
 from .legends import add_color_bar, finished, round_numbers
-from .style import METHOD_COLORS, WIDTH, corners_of, frame_domain, interactive_figure, single_height, styled
-
-if TYPE_CHECKING:
-    from ..geometry.shapes import Edges
+from .style import WIDTH, corners_of, frame_domain, interactive_figure, single_height, styled
 
 MOST_POLYGONS = 30_000
 """With more cells in a picture, it is an image."""
@@ -89,59 +86,6 @@ def _with_rim(cells: np.ndarray) -> np.ndarray:
 
 _LINE = {"edgecolor": "#1A1A1A", "linewidth": 0.8, "facecolor": "none", "joinstyle": "round"}
 _MARGIN = 0.01  # of the longer side, around a whole domain
-_DASHES = ("-", "--", ":", "-.")  # for more names than colors
-
-
-def plot_boundaries(domain: Domain, ax: Any = None, *, numbers: bool = False) -> Any:
-    """Draw the boundary of a 2D domain with one color for each name, before or over a mesh.
-
-    Parameters
-    ----------
-    domain : Box or Polygon
-    ax : matplotlib axes, optional
-        Drawn into; a new figure by default.
-    numbers : bool
-        Write the number of each edge or side at its middle.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-
-    Raises
-    ------
-    InputError
-        For a domain in 3D or on a sphere.
-    """
-    domain.require_plane("plot_boundaries draws in the plane", "call result.plot()")
-    with styled():
-        if ax is None:
-            height = single_height(domain.lower, domain.upper, legend=True)
-            ax = interactive_figure(WIDTH, height).add_subplot()
-            frame_part(ax, domain, domain.lower, domain.upper)
-        for k, name in enumerate(domain.boundary_names):
-            walls = np.flatnonzero(domain.boundary_index == k)
-            if domain.outline is not None:  # edges without length cannot be drawn
-                walls = walls[domain.outline.oriented.places[walls] >= 0]
-            curves = [cast("Edges", domain.boundary(wall)) for wall in walls.tolist()]
-            segments = [np.vstack([c.begin, c.end]) for c in curves]
-            color = METHOD_COLORS[k % len(METHOD_COLORS)]
-            style = _DASHES[k // len(METHOD_COLORS) % len(_DASHES)]
-            lines = LineCollection(
-                segments, colors=color, linestyles=style, linewidths=2, label=name, zorder=3, clip_on=False
-            )
-            ax.add_collection(lines, autolim=False)
-            for wall, segment in zip(walls, segments, strict=True) if numbers else ():
-                ax.annotate(
-                    str(wall),
-                    segment.mean(axis=0),
-                    color=color,
-                    zorder=4,
-                    ha="center",
-                    va="center",
-                    bbox={"facecolor": "white", "edgecolor": "none", "pad": 0.8},
-                )
-        ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.12), ncols=4, frameon=False)
-    return ax.figure
 
 
 def frame_part(ax: Any, domain: Domain, lower: Any, upper: Any, ticks: bool = True) -> None:

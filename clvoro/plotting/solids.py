@@ -302,6 +302,13 @@ def view_axes(angles: tuple[float, float]) -> tuple[np.ndarray, np.ndarray, np.n
     return right, np.cross(towards, right), towards
 
 
+def brightness(normals: np.ndarray, angles: tuple[float, float]) -> np.ndarray:
+    """Return the brightness (n,) of faces with `normals` (n, 3), in light from above, a little from the left."""
+    right, up, towards = view_axes(angles)
+    light = 0.5 * towards + 0.62 * up - 0.3 * right
+    return 0.72 + 0.28 * np.clip(normals @ light / np.linalg.norm(light), 0, 1)
+
+
 def cut_cells(diagram: Diagram, normal: np.ndarray, point: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
     """Return the cells (k,) that a plane cuts, and the polygons (c, 3) in which it does.
 
@@ -451,9 +458,7 @@ def _draw_cutaway(
     frame_domain(ax, lower - margin, upper + margin)
     ax.set_axis_off()
     ax.add_collection(LineCollection(list(frame), colors="#B0B0B0", linewidths=0.6, zorder=0))
-    # The light comes from above, a little from the left.
-    light = 0.5 * towards + 0.62 * up - 0.3 * right
-    shade = 0.72 + 0.28 * np.clip(normals @ light / np.linalg.norm(light), 0, 1)
+    shade = brightness(normals, angles)
     widths, colors = edge_widths(ax, flat) if edges else np.zeros(len(flat)), paint.rgba(cells)
     wall = _walls_of(diagram, polygons) if polygons else np.zeros(0, int)
     if polygons:

@@ -247,8 +247,41 @@ def test_plots_show_the_names(meshed) -> None:
     assert len({tuple(c.get_color()[0]) for c in lines.values()}) == len(lines)
     over = result.plot("volume")
     assert plot_boundaries(clvoro.Box((0, 0), (1, 1)), over.axes[0]) is over
-    with pytest.raises(InputError, match="draws in the plane"):
-        plot_boundaries(clvoro.Box((0, 0, 0), (1, 1, 1)))
+    with pytest.raises(InputError, match="in the plane and in space"):
+        plot_boundaries(clvoro.Sphere(1))
+
+
+@pytest.mark.parametrize(
+    ("domain", "seen", "hidden"),
+    [
+        (lambda: clvoro.Solid.ball((0, 0, 0), 1, 0.2) - clvoro.Solid.ball((0, 0, 0), 0.5, 0.2), [0], "hidden: 1"),
+        (
+            lambda: clvoro.Solid.outside(clvoro.Solid.box((1, 1, 1), (2, 2, 2)), clvoro.Box((0,) * 3, (3,) * 3)),
+            range(12),
+            "",
+        ),
+    ],
+    ids=["a ball with a cavity", "around a box"],
+)
+def test_plots_show_walls_in_space(domain, seen, hidden) -> None:
+    pytest.importorskip("trimesh")
+    from clvoro.plotting import plot_boundaries
+    from clvoro.plotting.solids import VIEW, view_axes
+
+    shape = domain()
+    figure = plot_boundaries(shape, numbers=True)
+    for ax, angles in zip(figure.axes, (VIEW, (VIEW[0] + 180, -VIEW[1])), strict=True):
+        right, up, _ = view_axes(angles)
+        for text in ax.texts:
+            corners = shape.boundary(int(text.get_text())).corners @ np.stack([right, up], axis=1)
+            drawn = shapely.union_all(shapely.convex_hull(shapely.multipoints(corners)))
+            assert drawn.distance(shapely.Point(text.xy)) < 1e-9
+    assert {int(text.get_text()) for ax in figure.axes for text in ax.texts} == set(seen)
+    assert figure.get_supxlabel() == hidden
+    named = plot_boundaries(shape)
+    assert [text.get_text() for text in named.legends[0].get_texts()] == list(shape.boundary_names)
+    with pytest.raises(InputError, match="leave ax out"):
+        plot_boundaries(shape, figure.axes[0])
 
 
 SQUARE = [(0, 0), (1, 0), (1, 1), (0, 1)]
