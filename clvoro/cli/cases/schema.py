@@ -614,6 +614,7 @@ class SolidTable(Kind, tag="solid"):
     angle: Positive | None = None
     join: NotNegative | None = None
     repair: bool | None = None
+    wrap: Positive | None = None
     surfaces: Text | list[SurfaceTable] | None = None
 
     def build(self, folder: Path, domain: Any = None) -> Solid:

@@ -19,6 +19,7 @@ _FLAT = 1e-3  # of the extent of a hole: how far it may deviate from a plane
 _APART = 1e-6  # of the diagonal: how far from a triangle its two sides are examined
 _LARGEST_GAP = 1e-3  # of the diagonal: gaps that `join` may close
 _SHARPEST = 10.0  # degrees
+_OR_WRAP = "Or pass wrap=, of about half a cell: a closed surface around what is there"
 
 
 def closing_distance(surface: Surface) -> float | None:
@@ -76,9 +77,8 @@ def require_bounding(surface: Surface, vertices: np.ndarray, triangles: np.ndarr
         try:
             surface.require_closed()
         except InputError as error:
-            if join is None:
-                raise
-            raise InputError(f"{error}. Here join={join:g} closes it") from None
+            remedy = _OR_WRAP if join is None else f"Here join={join:g} closes it"
+            raise InputError(f"{error}. {remedy}") from None
     twin, bad = pair_sides(vertices, triangles)
     if bad.size:
         k, s = divmod(int(bad[0]), 3)
@@ -90,7 +90,8 @@ def require_bounding(surface: Surface, vertices: np.ndarray, triangles: np.ndarr
     try:
         Surface(vertices, triangles, name).check()
     except InputError as error:
-        raise InputError(f"{error}. Parts that cross or touch each other are united by repair=True") from None
+        united = "Parts that cross or touch each other are united by repair=True"
+        raise InputError(f"{error}. {united}. {_OR_WRAP}") from None
     inner, outer = _sides_wound(vertices, triangles, twin)
     wrong = np.flatnonzero((inner != 1) | (outer != 0))
     if not wrong.size:

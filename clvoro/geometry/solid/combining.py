@@ -72,7 +72,7 @@ def library() -> Any:
         import manifold3d
     except ImportError as error:
         raise MissingLibraryError(
-            "booleans of solids, repair of holes and overlaps, and bodies that touch or cross their box need "
+            "booleans of solids, repair of holes and overlaps, wraps, and bodies that touch or cross their box need "
             "manifold3d; pip install 'clvoro[solids]' (or pip install manifold3d)"
         ) from error
     return manifold3d

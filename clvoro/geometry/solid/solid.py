@@ -33,12 +33,14 @@ from .checks import repaired, require_bounding, sharp_edges, volume_inside
 from .combining import around, boolean, named_triangles
 from .creases import CONCAVE, CONVEX, connect, corner_normals, dihedral_turns, find_creases, triangle_normals
 from .stations import Stations, place_stations
+from .wrapping import wrapped
 
 _ON = 1e-12  # of the diagonal: points this close to the surface lie on it
 _PROBES = 4096  # places on the surface from which widths are measured
 _FACING = -0.7  # product of the normals of two walls that face each other
 _SAMPLES = 2048  # places on the surface from which the search for nearest points begins, besides vertices
 _MOST_STEPS = 64  # along a side of a triangle
+_WRAPPED = 150.0  # degrees: a wrap has no creases
 _MARGIN = 0.05  # of the longest edge, by which the clip box is larger than the region
 
 
@@ -138,8 +140,8 @@ class Solid(Domain):
         one; by default ``wall``.
     names : mapping, optional
         Names of boundaries, each with its patches: numbers, names of groups, or a sequence of them.
-    angle : float
-        Edges at which the surface turns by more than this are creases, in degrees.
+    angle : float, optional
+        Edges at which the surface turns by more than this are creases, in degrees; by default 30, or 150 with `wrap`.
     join : float
         Distance within which vertices count as one.
     name : str
@@ -150,6 +152,11 @@ class Solid(Domain):
         names ``hole-1``, ... Other holes, and parts that cross themselves, stay errors.
     creases : (e, 2) int, optional
         More edges at which patches end, as pairs of vertices.
+    wrap : float, optional
+        Take a closed surface around all triangles in their place, whatever is wrong with them. It is about wrap / 2
+        outside of them, and closes holes and gaps up to 2 wrap wide; sheets become plates as thick as `wrap`. What is
+        finer is left out, with sharp edges and groups. A warning says how far the surface is from the triangles at
+        most. It suits cells of twice this size, or smaller ones.
 
     Attributes
     ----------
@@ -167,7 +174,7 @@ class Solid(Domain):
         If the surface is not closed, intersects itself, or its normals do not point outwards; or a number or name is
         wrong.
     MissingLibraryError
-        If a repair needs manifold3d, which is not installed.
+        If a repair or a wrap needs manifold3d, which is not installed.
 
     Warns
     -----
@@ -191,11 +198,12 @@ class Solid(Domain):
         groups: object = None,
         group_names: Sequence[str] | None = None,
         names: Mapping[str, Walls] | None = None,
-        angle: float = 30.0,
+        angle: float | None = None,
         join: float = 0.0,
         name: str = "Solid",
         repair: bool = False,
         creases: object = None,
+        wrap: float | None = None,
     ):
         given = Surface(vertices, triangles, name, join)
         group = _checked_groups(name, groups, len(given))
@@ -207,12 +215,18 @@ class Solid(Domain):
         if repair:
             given, group, self.repairs, holes = repaired(given, group, len(known))
             self._group_names += tuple(f"hole-{k + 1}" for k in range(holes))
+        if wrap is not None:
+            given, done = wrapped(given, wrap)
+            group, self.repairs = np.zeros(len(given), np.int64), (*self.repairs, done)
+            self._group_names = ("wall",) if len(known) > 1 else tuple(known)
+            angle = _WRAPPED if angle is None else angle
         places, merged = given.welded
         self._places = given.places
         whole = (merged != np.roll(merged, -1, axis=1)).all(axis=1)
         self._group, merged = group[whole], merged[whole]
         self.surface = Surface(places, merged, name)
         self.twin = require_bounding(given, places, merged)
+        angle = 30 if angle is None else angle
         if not (isinstance(angle, Real) and 0 < angle < 180):
             raise InputError(f"{name} angle is {angle!r}, expected degrees between 0 and 180")
         self.angle = float(angle)

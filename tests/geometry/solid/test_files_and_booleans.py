@@ -184,6 +184,24 @@ def test_a_flat_sheet_stays_open():
         Solid(V, T[:2], repair=True)
 
 
+@pytest.mark.parametrize(
+    ("vertices", "triangles", "volume"),
+    [
+        (V, T[:2], 0.267),  # a sheet: a plate with round edges
+        (V, T[2:], 1.0),  # five sides of a cube: a hollow one
+        (V, sides(V, 2)[1:], 0.8),
+        (np.vstack([V, V + 0.5]), np.vstack([T, T[:2], T + 8]), 3.07),  # cubes that cross, and triangles twice
+    ],
+)
+def test_a_wrap_is_closed_around_all_triangles(vertices, triangles, volume):
+    with pytest.warns(MismatchWarning, match="wrapped, at most 0") as caught:
+        solid = Solid(vertices, triangles, group_names=["body"], wrap=0.2)
+    assert solid.measure == pytest.approx(volume, rel=0.1)
+    assert (len(caught), len(solid.creases), solid.boundary_names) == (1, 0, ("body",))
+    assert solid.contains(vertices).all()
+    assert solid.boundary_distance(vertices).min() > 0.06
+
+
 def test_vertices_within_round_off_are_one():
     assert Solid(*with_gap(1e-15)).measure == pytest.approx(1)
 
@@ -203,6 +221,8 @@ def test_edges_sharper_than_ten_degrees_are_warned_of():
         ({"angle": 200}, "angle is 200"),
         ({"creases": [(0, 99)]}, "creases have vertices up to 99"),
         ({"names": {"inlet": "nowhere"}}, "nowhere"),
+        ({"wrap": -1}, "wrap is -1, expected a length"),
+        ({"wrap": 1e-4}, "too small for its extent"),
     ],
 )
 def test_wrong_options_are_refused(options, says):
