@@ -263,16 +263,6 @@ def test_tables_of_other_programs(tmp_path):
         assert values["u"].tolist() == x[:, 0].tolist() == pytest.approx(found.points.sum(axis=1))
 
 
-def test_cells_that_meshio_does_not_know(tmp_path):
-    """VTK's voxels, of which a grid is made."""
-    corners = " ".join(map(str, range(8)))
-    points = " ".join(f"{x} {y} {z}" for z in (0, 1) for y in (0, 1) for x in (0, 1))
-    text = f"# vtk DataFile Version 3.0\ngrid\nASCII\nDATASET UNSTRUCTURED_GRID\nPOINTS 8 float\n{points}\n"
-    (tmp_path / "g.vtk").write_text(f"{text}CELLS 1 9\n8 {corners}\nCELL_TYPES 1\n11\n")
-    with pytest.raises(InputError, match="Cell Centers"):
-        clvoro.read_fields(tmp_path / "g.vtk", domain=CUBE)
-
-
 def test_files_that_are_damaged(tmp_path, capfd):
     for name in ("f.vtu", "f.nc", "f.npz", "f.vtk", "f.msh"):
         (tmp_path / name).write_bytes(b"\x00what is this?")

@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 
 import clvoro
-from clvoro.errors import InputError
 from clvoro.geometry.boundary_names import BoundaryNames
 from clvoro.geometry.domain import Domain
 
@@ -82,10 +81,3 @@ def test_runs(name):
     assert np.ptp(mesh.transfer(np.ones(len(mesh.points)), mesh)) < 1e-14
     mesh.plot("size")
     plt.close("all")
-
-
-def test_a_file_with_an_unknown_class_says_what_to_do(tmp_path, monkeypatch):
-    clvoro.voronoi(OWN["slab"], points_in(OWN["slab"], 9)).save(tmp_path / "mesh.npz")
-    monkeypatch.delitem(Domain.kinds, "Slab")
-    with pytest.raises(InputError, match=r"mesh\.npz.* is a 'Slab', expected one of Box, .*; import the class"):
-        clvoro.load(tmp_path / "mesh.npz")

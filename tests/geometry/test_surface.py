@@ -1,6 +1,5 @@
 """Triangulated surfaces: distance against brute force, reading, closedness, self-intersection."""
 
-import builtins
 import warnings
 
 import numpy as np
@@ -400,20 +399,6 @@ def test_invalid_normals_in_files_are_ignored(tmp_path, caplog):
         warnings.simplefilter("error", DeprecationWarning)  # raised by NumPy
         assert len(sizing.Surface.read(tmp_path / "part.stl")) == 1
     assert not caplog.records
-
-
-def test_missing_reader_is_named(tmp_path, monkeypatch):
-    (tmp_path / "part.stl").write_bytes(b"solid")
-    real = builtins.__import__
-
-    def without(name, *rest):
-        if name == "trimesh":
-            raise ImportError(name)
-        return real(name, *rest)
-
-    monkeypatch.setattr(builtins, "__import__", without)
-    with pytest.raises(InputError, match=r"pip install 'clvoro\[surfaces\]'"):
-        sizing.Surface.read(tmp_path / "part.stl")
 
 
 @pytest.mark.parametrize(

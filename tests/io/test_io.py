@@ -7,7 +7,6 @@ import json
 import os
 import pickle
 import stat
-import sys
 import xml.etree.ElementTree as ElementTree
 import zipfile
 
@@ -331,13 +330,6 @@ def test_formats_that_cannot_hold_polygons_are_refused(result, tmp_path, name):
     with pytest.raises(InputError, match=r"mesh.*\.vtu"):
         io.save(result, tmp_path / name)
     assert not list(tmp_path.iterdir())
-
-
-def test_missing_meshio_is_named(result, tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "meshio", None)
-    with pytest.raises(InputError, match=r"clvoro\[formats\]"):
-        io.save(result, tmp_path / "mesh.vtk")
-    io.save(result, tmp_path / "mesh.vtu")
 
 
 def test_history_reads_back_exactly(result, tmp_path):

@@ -326,13 +326,6 @@ def test_fipy_joins_the_sides_of_periodic_boxes(dim):
     np.testing.assert_allclose(u.value, expected, atol=1e-9)
 
 
-def test_fipy_refuses_a_cell_beside_its_own_image():
-    pytest.importorskip("fipy")
-    torus = clvoro.voronoi(clvoro.Box((0, 0), (1, 1), periodic=(True, False)), [(0.2, 0.5)])
-    with pytest.raises(InputError, match="cell 0 borders on its own periodic image"):
-        torus.to_fipy()
-
-
 @pytest.mark.parametrize("walls", ["exact", "straight"])
 def test_vtu_has_the_names_of_boundaries(lake, tmp_path, meshio_for_vtu, walls):
     lake.to_vtu(tmp_path / "lake.vtu", walls=walls)

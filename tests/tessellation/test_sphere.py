@@ -153,12 +153,6 @@ def test_the_free_half_is_named(ctx, lonlat, message):
         clvoro.Adapter(ctx).diagram(UNIT, lonlat)
 
 
-def test_generators_that_coincide(ctx):
-    points = np.concatenate([SETS["few"], SETS["few"][:1]])
-    with pytest.raises(InputError, match="coincide"):
-        clvoro.Adapter(ctx).diagram(UNIT, points)
-
-
 @pytest.mark.sparse(2)
 @pytest.mark.parametrize("real", PRECISIONS)
 @pytest.mark.parametrize("step", [1e-3, 0.02, 0.2])

@@ -1,12 +1,10 @@
 """Solids from files, bodies in a box, booleans; and surfaces that bound no region."""
 
-import sys
-
 import numpy as np
 import pytest
 
 from clvoro import Box, Solid
-from clvoro.errors import InputError, MismatchWarning, MissingLibraryError
+from clvoro.errors import InputError, MismatchWarning
 
 CUBE = Solid.box((0, 0, 0), (1, 1, 1))
 V, T = CUBE.surface.vertices, CUBE.surface.triangles
@@ -58,13 +56,6 @@ def test_a_step_file_is_read_in_meters(tmp_path):
     solid = Solid.read(tmp_path / "part.step")
     assert solid.measure == pytest.approx(np.pi * 0.005**2 * 0.02, rel=0.02)
     assert solid.n_patches == 3
-
-
-def test_step_without_gmsh_says_what_to_install(tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "gmsh", None)
-    (tmp_path / "part.step").write_text("")
-    with pytest.raises(MissingLibraryError, match=r"clvoro\[step\]"):
-        Solid.read(tmp_path / "part.step")
 
 
 def test_the_outside_of_a_body_has_the_names_of_both():
@@ -177,11 +168,6 @@ def test_repair_mends_what_is_certain_and_says_so(vertices, triangles, says, vol
     assert solid.measure == pytest.approx(volume, rel=1e-3)
     holes = [name for name in solid.boundary_names if name.startswith("hole")]
     assert holes == (["hole-1", "hole-2"] if "holes" in says else [])
-
-
-def test_a_flat_sheet_stays_open():
-    with pytest.raises(InputError, match="is open: 4 edges"):
-        Solid(V, T[:2], repair=True)
 
 
 @pytest.mark.parametrize(
