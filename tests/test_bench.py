@@ -68,17 +68,6 @@ def test_transfer():
 
 
 @pytest.mark.slow
-def test_poisson_order():
-    rows = records("poisson_order.py", "--only", "circle", "--place", "foot,center")
-    last = {(r["conditions"], r["place"]): r["orders"] for r in rows if r["cells"] > 15_000}
-    assert len(last) == 4
-    for conditions in ("Dirichlet", "mixed"):
-        assert last[conditions, "foot"]["max"] > 1.7
-        assert last[conditions, "foot"]["l2"] > 1.9
-        assert last[conditions, "center"]["max"] < 1.4
-
-
-@pytest.mark.slow
 def test_shallow_water():
     # The script itself fails if a run is unstable, or a balance is not round-off.
     rows = records(
