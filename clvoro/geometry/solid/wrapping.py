@@ -51,7 +51,7 @@ def wrapped(surface: Surface, reach: float) -> tuple[Surface, str]:
         raise InputError(
             f"{surface.name} wrap is {reach:g}, which is too small for its extent; use {least:.2g} or more"
         )
-    grid = _Grid(low, step, shape)
+    grid = _Sampled(low, step, shape)
     away = grid.distance(surface, 2 * reach)
     part = scipy.ndimage.label(away > reach)[0]
     outer = part == part[0, 0, 0]
@@ -61,14 +61,14 @@ def wrapped(surface: Surface, reach: float) -> tuple[Surface, str]:
     return made, f"wrapped, at most {_distance(surface, made.vertices, math.inf).max():.3g} away from what was given"
 
 
-class _Grid:
+class _Sampled:
     """Points `step` apart."""
 
     def __init__(self, low: np.ndarray, step: float, shape: np.ndarray) -> None:
         self.low, self.step, self.shape = low, step, shape
 
     def distance(self, surface: Surface, reach: float, where: np.ndarray | None = None) -> np.ndarray:
-        """Return the distance of each point from a surface, up to `reach`, and `reach` where it is not asked for."""
+        """Return the distance of each point from a surface, up to `reach`, and `reach` where it is not computed."""
         blocks = np.stack(np.meshgrid(*(np.arange(0, n, _BLOCK) for n in self.shape), indexing="ij"), -1).reshape(-1, 3)
         begin = self.low + self.step * blocks
         met = np.unique(surface.tree.meeting(begin - reach, begin + _BLOCK * self.step + reach)[0])
