@@ -422,17 +422,19 @@ def _geometry_of_diagram(f: Faces, diagram: Diagram) -> dict[str, np.ndarray]:
 
 
 def _correct_cut_faces(f: Faces, normal: np.ndarray, distance: np.ndarray, center: np.ndarray) -> None:
-    """Take the normals of faces that are not on the bisector of their generators from their ends."""
-    k = np.flatnonzero(f.neighbor >= 0)
-    middle = (f.generators[f.owner[k]] + f.generators[f.neighbor[k]]) / 2
-    off = np.abs(((center[k] - middle) * normal[k]).sum(axis=1))
-    begin, end = f.points[f.corners.reshape(-1, 2)[k]].swapaxes(0, 1)
+    """Take the normals of faces that are not on the bisector of their generators from their ends.
+
+    The other generator may be that of a cell that is not in the domain any more.
+    """
+    begin, end = f.points[f.corners.reshape(-1, 2)].swapaxes(0, 1)
     along = end - begin
     length = np.hypot(*along.T)
-    slope = np.abs((along * normal[k]).sum(axis=1))
-    far = OFF_BISECTOR * distance[k]
-    cut = (off > far) | (slope > np.maximum(OFF_BISECTOR * length, far))
-    normal[k[cut]] = np.stack([along[cut, 1], -along[cut, 0]], axis=1) / length[cut, None]
+    far = OFF_BISECTOR * distance
+    cut = np.abs((along * normal).sum(axis=1)) > np.maximum(OFF_BISECTOR * length, far)
+    k = np.flatnonzero(f.neighbor >= 0)
+    middle = (f.generators[f.owner[k]] + f.generators[f.neighbor[k]]) / 2
+    cut[k] |= np.abs(((center[k] - middle) * normal[k]).sum(axis=1)) > far[k]
+    normal[cut] = np.stack([along[cut, 1], -along[cut, 0]], axis=1) / length[cut, None]
 
 
 def _distances(arm: np.ndarray, normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

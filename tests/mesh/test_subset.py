@@ -75,6 +75,18 @@ def test_faces_towards_removed_cells_know_their_generators(whole, keep, part):
     assert not part.domain.contains(whole.points[~keep]).any()
 
 
+def test_normals_of_faces_are_right_on_both_sides_of_cuts(ctx):
+    """Cells at a thin slit end where its tip cuts their faces, also if the cell on the other side was removed."""
+    comb = clvoro.Polygon([(0, 0), (2, 0), (2, 1), (1.02, 1), (1.02, 0.3), (0.98, 0.3), (0.98, 1), (0, 1)])
+    points = np.random.default_rng(0).uniform([0, 0], [2, 1], (60, 2))
+    whole = clvoro.Adapter(ctx).diagram(comb, points[comb.contains(points)])
+    beside = np.abs(whole.points[:, 0] - 1) < 0.3
+    for side in (-1, 1):
+        part = whole.subset(~beside | (side * (whole.points[:, 0] - 1) > 0))
+        begin, end = part.faces.points[part.faces.corners.reshape(-1, 2)].swapaxes(0, 1)
+        assert ((end - begin) * part.faces.normal).sum(axis=1) == pytest.approx(0, abs=1e-9)
+
+
 def test_solvers_get_parts(part, tmp_path):
     part.to_openfoam(tmp_path / "polyMesh")
     assert "hole" in (tmp_path / "polyMesh" / "boundary").read_text()
