@@ -1,16 +1,5 @@
 #include "opencl/real.h"
 
-/* Per row i: owners in place of the ghosts, neighbors from number n on, that have one. */
-kernel void name_owners(const int size, const int n, global const int *owners, global const int *starts,
-                        global const int *neighbors, global int *named)
-{
-    WORK_ITEM(i);
-    for (int k = starts[i]; k < starts[i + 1]; ++k) {
-        const int row = neighbors[k], owner = row < n ? row : owners[row - n];
-        named[k] = owner < 0 ? row : owner;
-    }
-}
-
 /* A number from 1 to 2 for the face between the generators with labels a and b, whichever comes first. */
 inline REAL weight_of_face(int a, int b)
 {

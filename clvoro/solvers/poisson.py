@@ -70,7 +70,7 @@ class Laplacian:
     starts: cla.Array
     """(n + 1,) int32."""
     neighbors: cla.Array
-    """(m,) int32. Neighbors of the diagram, owners in place of ghosts: walls are negative."""
+    """(m,) int32. Neighbors of the diagram, or ghosts with `part`; walls are negative."""
     weights: cla.Array
     """(m,) real or float32. w_ij = rho_ij l_ij / d_ij; 0 at walls."""
     part: Part | None = None
@@ -157,13 +157,13 @@ class Poisson:
         tolerance : float
             Tolerance of the solves to come. From `SINGLE_PRECISION_TOLERANCE` on weights and vectors are in float32.
         part : Part, optional
-            The part whose rows `neighbors` names, if it has ghosts. Those with an owner in it are replaced by this one.
+            The part whose rows `neighbors` names, if it has ghosts.
             If owners are in other parts, `apply` takes x with their values, and all parts call `solve` together.
 
         Returns
         -------
         Laplacian
-            Its weights, and columns of a part, are in the workspace and valid to the end of the present frame.
+            Its weights are in the workspace and valid to the end of the present frame.
         """
         engine = self.engine
         n = len(starts) - 1
@@ -187,8 +187,7 @@ class Poisson:
             weights,
             *self.engine.period_args,
         )
-        columns = neighbors if part is None else part.name_owners(engine, starts, neighbors)
-        return Laplacian(starts, columns, weights, None if part is None or part.peers is None else part)
+        return Laplacian(starts, neighbors, weights, None if part is None or part.peers is None else part)
 
     def inverse_diagonal(self, laplacian: Laplacian) -> cla.Array:
         """Return the inverse row sums of the weights (n,), 0 for a sum of 0, in the workspace."""

@@ -168,18 +168,6 @@ class Part:
         """The other parts of the domain, if there are any."""
         return None if self.ghosts is None else self.ghosts.peers
 
-    def name_owners(self, engine: Engine, starts: cla.Array, neighbors: cla.Array) -> cla.Array:
-        """Return `neighbors` (m,) with owners in place of the ghosts that have one in this part.
-
-        They are in the workspace. Rows begin at `starts` (n_own + 1,).
-        """
-        if self.ghosts is None or self.peers is not None:
-            return neighbors
-        named = engine.scratch(len(neighbors), np.int32)
-        kernel = engine.kernels("tessellation/part", shared=True).name_owners
-        engine.run_each(kernel, self.n_own, np.int32(self.n_own), self.ghosts.rows, starts, neighbors, named)
-        return named
-
     def order_rows(
         self, engine: Engine, t: Tessellation, defines: dict[str, object], enqueue: Callable[..., object] | None = None
     ) -> None:

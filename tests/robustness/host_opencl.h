@@ -51,7 +51,9 @@ void barrier(uint flags);
             r[k] = name(a[k], b, c);                                                                                   \
         return r;                                                                                                      \
     }
-#define MAP1(T, name) MAP1_(T, T##2, 2, name, T##2) MAP1_(T, T##4, 4, name, T##4) MAP1_(T, T##8, 8, name, T##8)
+#define MAP1(T, name)                                                                                                  \
+    MAP1_(T, T##2, 2, name, T##2)                                                                                      \
+    MAP1_(T, T##3, 3, name, T##3) MAP1_(T, T##4, 4, name, T##4) MAP1_(T, T##8, 8, name, T##8)
 #define MAP2(T, name) MAP2_(T##2, 2, name) MAP2_(T##4, 4, name) MAP2_(T##8, 8, name)
 #define MAP2S(T, name) MAP2S_(T, T##2, 2, name) MAP2S_(T, T##4, 4, name) MAP2S_(T, T##8, 8, name)
 #define MAP3(T, name) MAP3_(T##2, 2, name) MAP3_(T##4, 4, name) MAP3_(T##8, 8, name)
@@ -88,6 +90,7 @@ REAL1(log2)
 REAL1(log10)
 REAL1(exp)
 REAL1(exp2)
+REAL1(expm1)
 REAL1(sin)
 REAL1(cos)
 REAL1(tan)
@@ -103,6 +106,7 @@ REAL2_(fmin)
 REAL2_(atan2)
 REAL2_(pow)
 REAL2_(hypot)
+REAL2_(copysign)
 REAL2_(fmod)
 MAP2S(float, fmax)
 MAP2S(double, fmax)
@@ -292,7 +296,7 @@ ANY(long)
         for (int k = 0; k < n; ++k)                                                                                    \
             to[at * n + k] = a[k];                                                                                     \
     }
-#define LOADS_(T, SPACE) LOAD(T, 2, SPACE) LOAD(T, 4, SPACE) LOAD(T, 8, SPACE) LOAD(T, 16, SPACE)
+#define LOADS_(T, SPACE) LOAD(T, 2, SPACE) LOAD(T, 3, SPACE) LOAD(T, 4, SPACE) LOAD(T, 8, SPACE) LOAD(T, 16, SPACE)
 #define LOADS(T) LOADS_(T, global) LOADS_(T, private)
 LOADS(float)
 LOADS(double)

@@ -28,6 +28,7 @@ from clvoro.adaptation.plan.actions import (
 from clvoro.geometry.domain import Domain
 from clvoro.sizing import Expression
 from clvoro.tessellation import incremental as repair
+from clvoro.tessellation import power as power_stages
 
 Work = Callable[[clvoro.Adapter], None]
 
@@ -39,12 +40,13 @@ LEAST_GAIN = 0.01
 
 @contextmanager
 def as_for_many() -> Iterator[None]:
-    """Use the kernels of large meshes: launches for iterations, and lanes to find cells to clip."""
+    """Use the kernels of large meshes: launches for iterations, lanes to find cells to clip, and rings around cells."""
     with ExitStack() as patches:
         for name, module in list(sys.modules.items()):
             if name.startswith("clvoro.") and hasattr(module, "one_group_limit"):
                 patches.enter_context(mock.patch.object(module, "one_group_limit", return_value=0))
         patches.enter_context(mock.patch.object(repair, "FEW", 8))
+        patches.enter_context(mock.patch.object(power_stages, "RINGS_FROM", 0))
         yield
 
 
@@ -166,6 +168,8 @@ def periodic_power(adapter: clvoro.Adapter) -> None:
     """Power cells of equal volumes in a periodic box in 3D. Too few for a run."""
     box = clvoro.Box((0, 0, 0), (1, 1, 1), periodic=True)
     transport(adapter, box, np.random.default_rng(37).random((20, 3)))
+    ball = clvoro.Sphere(1.0)
+    transport(adapter, ball, ball.even_points(30))
 
 
 FLAT, CUBE = clvoro.Box((0, 0), (1, 1)), clvoro.Box((0, 0, 0), (1, 1, 1))
@@ -188,7 +192,7 @@ RUNS: dict[str, Work] = {
     "power": power(clvoro.Box((0, 0), (2.5, 1.5)), 60),
     "polygon-power": power(NOTCHED, 40),
     "solid-power": power(CUBE, 40),
-    "periodic-power": power(SQUARE, 60),
+    "periodic-power": large(power(SQUARE, 60)),
     "solid-periodic-power": periodic_power,
 }
 """The numbers are chosen so that cells are inserted, or deleted, after refinement."""

@@ -27,6 +27,7 @@ from clvoro.opencl import program as _program
 from clvoro.opencl.engine import Engine
 from clvoro.opencl.primitives import Scan
 from clvoro.sizing import Ball, Circle, ClosedPolyline, Distance, Expression, Graded, Raster, Sizing, Surface, minimum
+from clvoro.sizing.derivatives import CellStencils, Derivatives
 from clvoro.tessellation import back_ends
 from clvoro.tessellation.face_rows import SLOT
 from clvoro.tessellation.part import Part
@@ -34,7 +35,7 @@ from clvoro.tessellation.tessellator import Tessellator
 from tests.reference.patch import BOX as PATCH
 from tests.reference.patch import hexagons, tessellate
 from tests.robustness.gpu_like import use_groups
-from tests.robustness.oclgrind_runs import COMB, RUNS, large
+from tests.robustness.oclgrind_runs import COMB, ROD, RUNS, SQUARE, every_step, large
 
 back_ends.LANES_FROM.update({2: 0, 3: 0})  # lanes for small meshes, too
 BOX = clvoro.Box((0, 0), (2.5, 1.5))
@@ -325,6 +326,30 @@ def ordered(adapter: clvoro.Adapter) -> None:
         Tessellator(stages, box).tessellate_part(replace(part, labels=labels))
 
 
+def parts(adapter: clvoro.Adapter) -> None:
+    """Runs by two parts, in every kind of domain that they share."""
+    two = clvoro.Adapter(devices=[adapter.ctx] * 2, dtype=adapter.dtype, share_gpus=True)
+    every_step(BOX, "0.2 + 0.05*x", 60, fixed=[(1, 0.5)])(two)
+    for domain, size in ((SQUARE, 0.12), (ROD, 0.13), (COMB, 0.3), (clvoro.Sphere(1.0), 0.35)):
+        two.run(domain, size, method="coupled", max_steps=2)
+
+
+def walls(adapter: clvoro.Adapter) -> None:
+    """Cells in a solid, with planes of their own, and generators around a concave crease."""
+    body = clvoro.Solid.box((0, 0, 0), (1, 1, 1)) - clvoro.Solid.box((0.5, 0.5, -1), (2, 2, 2))
+    adapter.run(body, 0.3, effort="fast", options=clvoro.MultilevelOptions(levels=0), max_steps=3, seed=911)
+
+
+def quadratics(adapter: clvoro.Adapter) -> None:
+    """Derivatives of cell data, with and without walls, on a sphere and of few cells."""
+    for domain, n in ((BOX, 40), (SQUARE, 60), (CUBE, 40), (clvoro.Sphere(1.0), 30), (BOX, 2)):
+        mesh = adapter.diagram(domain, domain.lower + points(n, domain.dim) * domain.extent)
+        engine = Engine(adapter.ctx, adapter.queue, domain.dim, np.dtype(adapter.dtype))
+        stencils = CellStencils.of(mesh)
+        found = Derivatives(engine, domain.cell_dim < domain.dim).fit_quadratics(stencils, mesh.centroids[:, :1], 1.0)
+        assert all(np.isfinite(each).all() for each in found)
+
+
 def copy(adapter: clvoro.Adapter) -> None:
     """The kernel with which a profile measures the bandwidth, on little memory."""
     source, target = (stages_of(adapter).engine.zeros(256, np.uint8) for _ in range(2))
@@ -482,6 +507,9 @@ WORK: dict[str, Callable[[clvoro.Adapter], None]] = {
     "gradation": gradation,
     "copy": copy,
     "ordered": ordered,
+    "parts": parts,
+    "walls": walls,
+    "quadratics": quadratics,
     "polygon": polygon,
     "comb": comb,
     "periodic": periodic,

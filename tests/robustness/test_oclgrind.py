@@ -31,7 +31,8 @@ TRAPS = {
     "local_race": "data race at local",
     "barrier_": "divergence detected",
 }
-USEFUL = [name for name in WORK if not name.startswith("broken")]
+USEFUL = [name for name in WORK if not name.startswith("broken") and name != "parts"]
+"""Parts are threads, which the simulator does not know. The sanitizers see their kernels."""
 VARIANTS = {"float64": (), "float32": ("float32",), "work-groups": ("groups",)}
 LANES = {
     "hulls.wrap_all_hulls",
@@ -48,11 +49,21 @@ TEAMS = {NEW, UPDATED}
 WITH_TEAMS = {"teams": ("groups", "teams"), "teams, float32": ("groups", "teams", "float32")}
 OF_TEAMS = [*((name, variant) for name in ("solid", "solid-coupled") for variant in WITH_TEAMS), ("rod-run", "teams")]
 """Work in 3D: sets of all kinds, updates with walls, and with periods, in which some cells change their vertices."""
+OF_PARTS = {
+    "part.follow_images",
+    "part.pack_rows",
+    "part.place_unfolded",
+    "part.shift_ghosts",
+    "part.sum_cells",
+    "part.unpack_rows",
+    "trim.limit_reach",
+}
 NOT_IN = {
     # Work-groups take it in place of two kernels.
-    "float64": {"conjugate_gradient.apply_to_direction"},
+    "float64": OF_PARTS | {"conjugate_gradient.apply_to_direction"},
     # Most of these are between float32 and the precision of the mesh.
-    "float32": LANES
+    "float32": OF_PARTS
+    | LANES
     | {
         "conjugate_gradient.apply_to_direction",
         "cells.clip_by_rings",
@@ -64,7 +75,7 @@ NOT_IN = {
         "multigrid.smooth_pairs_from_zero_rounded",
         "poisson.apply_laplacian_full",
     },
-    "work-groups": LANES | {"conjugate_gradient.update_direction"},
+    "work-groups": OF_PARTS | LANES | {"conjugate_gradient.update_direction"},
 }
 """Kernels that do not exist in a variant. All others run in it."""
 PATIENCE = 20

@@ -365,14 +365,3 @@ def test_a_periodic_box_that_is_not_folded(ctx, dim, real):
             assert outcome.converged
         one, other = (correction.get() for correction in corrections)
         assert np.abs(one - other).max() < 1e-4 * np.abs(other).max(), "derivatives are in single precision"
-        source, potentials = rng.standard_normal(n) / n, []
-        for part, made, poisson in ((alone.part, alone, unfolded.poisson), (None, t, stages.poisson)):
-            phi = poisson.engine.zeros(n)
-            matrix = poisson.assemble(made.starts, made.neighbors, made.face_measures, made.points, part=part)
-            tolerance = 1e-9 if real == np.float64 else 1e-4
-            for kind in ("jacobi", "multigrid"):
-                given = {"tolerance": tolerance, "preconditioner": kind, "from_zero": True}
-                assert poisson.solve(matrix, poisson.engine.upload(source), phi, **given).converged
-                potentials.append(phi.get())
-        for potential in potentials[1:]:
-            assert np.abs(potentials[0] - potential).max() < 1e3 * tolerance * np.abs(potential).max()
