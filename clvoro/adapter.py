@@ -471,7 +471,7 @@ class Adapter:
         max_steps : int, optional
             Largest number of steps, over all levels. By default 100, or all steps of the schedule of "adaptive",
             "exact" and "transport". From given points these leave out sweeps, so that their last steps, which polish,
-            are among them.
+            are among them; a mesh that is near its sizes is not only corrected if `max_steps` allows more.
         options : MultilevelOptions or PaperOptions, optional
             Further options: `MultilevelOptions` for those three methods, `PaperOptions` for the others.
         checkpoint : path or Checkpoint, optional

@@ -25,12 +25,12 @@ from .moving.lattice import lattice_points
 from .options import Options, RunArguments
 from .plan.actions import Action, Prescribe
 from .plan.efforts import NEAR_COUNT, NEAR_ERROR, choose_error_target, is_near, steep_share
-from .plan.schedule import Begins, adaptive_schedule, auto_levels, repeated_schedule
+from .plan.schedule import Begins, adaptive_schedule, auto_levels, n_steps, repeated_schedule
 from .sampling.quadrature import DensityTree
 from .sampling.start import charted, density_tree, replace_far, sample_density, sample_uniform
 from .stages import Stages
 from .state import MeshState, Setup
-from .tuning import CELLS_ACROSS, GRADIENT_STEP, LEAST_STEEP, MOVES, NEAR_SIZE, OPENINGS, SAMPLED_SIZES, STEPS
+from .tuning import CELLS_ACROSS, GRADIENT_STEP, LARGE, LEAST_STEEP, MOVES, NEAR_SIZE, OPENINGS, SAMPLED_SIZES, STEPS
 
 _APART = 0.7
 """Least distance of generators around concave creases from those beside surfaces inside, over h."""
@@ -312,7 +312,7 @@ def _count_levels(setup: Setup, points: np.ndarray | None, target: int, n_rows: 
         if points is not None:
             return max(0, round(math.log2(max(target - n_rows, 1) / len(points)) / d))
         levels = auto_levels(target - n_rows, d)
-        while levels and n_rows and _is_narrow(setup, 2**levels):
+        while levels and ((n_rows and _is_narrow(setup, 2**levels)) or _is_large(setup, 2**levels)):
             levels -= 1
         return levels
     count = int(levels)
@@ -331,6 +331,13 @@ def _is_narrow(setup: Setup, coarseness: float) -> bool:
     """Return whether a gap between layers is narrower than `CELLS_ACROSS` cells of size ``coarseness * h``."""
     scale = CELLS_ACROSS / NARROW * coarseness * setup.factor
     return setup.free.narrow_parts(lambda x: scale * setup.sizing(x))[0] is not None
+
+
+def _is_large(setup: Setup, coarseness: float) -> bool:
+    """Return whether cells of size ``coarseness * h`` may leave a half of a sphere free."""
+    largest = setup.domain.largest_size
+    h = coarseness * setup.factor * setup.sizing(setup.domain.even_points(SAMPLED_SIZES)) if largest < math.inf else 0.0
+    return float(np.max(h)) > LARGE * largest
 
 
 def start(prepared: Prepared) -> MeshState:
@@ -409,8 +416,10 @@ def judge_points(prepared: Prepared, mesh: MeshState) -> tuple[Beginning, Prepar
     near = not prepared.levels and is_near(prepared.setup.domain.cell_dim, options.effort, n, missing, mean, quality)
     off = f"{abs(missing) / n:.1%} of the cells too {'few' if missing > 0 else 'many'}"
     found = f"mean |e| {mean:.2g}, {off}, mean Q {quality:.3f}"
-    if near:
+    if near and (options.max_steps or 0) <= n_steps(plan(prepared, "near").schedule):
         return Beginning("near", f"the given mesh is near and only corrected ({found})"), prepared
+    if near:
+        return Beginning("mesh", f"the given mesh is near, and max_steps allows more steps ({found})"), prepared
     if options.levels == "auto" and (after := without_far(prepared)) is not prepared:
         if after.points is None:
             return Beginning(

@@ -40,6 +40,8 @@ from .transfer import MeshOfCase, check_fluxes, entries_at, fields_that_move, tr
 _MESH, _NOTE = "clvoro.npz", "clvoro.json"
 """Files beside those of a polyMesh: the generators, and what is known of the cycle."""
 _CELLS_PER_PATCH = 4
+_STEPS: dict[EffortName, int] = {"fast": 60, "default": 60, "best": 150}
+"""Steps of a cycle without a window."""
 Estimator = Callable[[Mapping[str, np.ndarray], Diagram, int], Estimate]
 
 
@@ -168,8 +170,8 @@ def adapt_case(
     """Adapt the mesh of a case of OpenFOAM to its latest solution, `cycles` times.
 
     A cycle reads the latest time, estimates sizes from its fields, makes a mesh with them, and transfers all fields in
-    cells. With `window` it begins from the present generators; without, all are new. The new mesh and its fields become
-    the latest time, in place of the old one, in one step: at any moment the case has a mesh that fits its fields.
+    cells. It begins from the present generators. The new mesh and its fields become the latest time, in place of the
+    old one, in one step: at any moment the case has a mesh that fits its fields.
     Fluxes `phi` are projected so that they are free of divergence. Names and types of patches and boundary conditions
     stay; their lists of values are interpolated.
 
@@ -413,10 +415,20 @@ class _Loop:
         size = self._sizes_in_window(fields, old, latest)
         layers = tuple(_layers_of(note["layers"])) if self.layers is None else self.layers
         domain = old.diagram.domain
-        # A run from given generators keeps their number along walls, even where sizes have changed: a steady flow gets
-        # a new mesh. Fields of an unsteady flow lose less in a transfer between similar meshes.
-        points = old.diagram.points if self.window else None
-        made = self.adapter.run(domain, size, self.effort, points=points, n_cells=self.n_cells, layers=layers)
+        # Centroids of cells that clvoro has not made may be outside of a curved wall.
+        points = old.diagram.points
+        points = points[domain.contains(points)]
+        # Fields of an unsteady flow lose less in a transfer between similar meshes, so that these are only corrected.
+        # Corrections add up to cells of a poorer shape: a steady flow takes more steps.
+        made = self.adapter.run(
+            domain,
+            size,
+            self.effort,
+            points=points,
+            n_cells=self.n_cells,
+            layers=layers,
+            max_steps=None if self.window else _STEPS[self.effort],
+        )
         mesh_seconds = time.perf_counter() - start
         zones = old.zones_on(made.diagram)
         make_folder(case.own)

@@ -22,6 +22,8 @@ if TYPE_CHECKING:
     from ..mesh.diagram import Diagram
     from ..mesh.results import Result
 
+LARGEST = 0.8
+"""Largest size of an estimate over that of a run, which scales the sizes to a number of cells."""
 SMOOTHED = 2
 """Number of passes that smooth sizes from second derivatives. These are noisy, and change their sign in a layer."""
 
@@ -252,7 +254,7 @@ def _places(stencils: CellStencils, slope: float, smoothed: int = 0) -> Places:
         limited = stencils.limit_growth(sizes, slope)
         return stencils.limit_growth(stencils.smooth(limited, smoothed), slope) if smoothed else limited
 
-    longest = min(float(domain.extent.max()), domain.largest_size)
+    longest = min(float(domain.extent.max()), LARGEST * domain.largest_size)
     return Places(stencils.mesh.volumes, domain.cell_dim, longest, limit)
 
 

@@ -39,7 +39,7 @@ def check_one_of(what: str, n_cells: object, eps: object) -> float:
 
 
 def check_bounds(what: str, h_min: object, h_max: object, longest: float) -> float:
-    """Return the largest size: `h_max`, or `longest` if that is infinite.
+    """Return the largest size: `h_max`, at most `longest`, at least `h_min`.
 
     Raises
     ------
@@ -51,7 +51,7 @@ def check_bounds(what: str, h_min: object, h_max: object, longest: float) -> flo
             raise InputTypeError(f"{what} {name} is {bound!r}, expected a number")
     if not (0 <= h_min <= h_max and h_min < math.inf and h_max > 0):  # type: ignore[operator]
         raise InputError(f"{what} got h_min={h_min} and h_max={h_max}, expected 0 <= h_min <= h_max")
-    return longest if math.isinf(h_max) else float(h_max)  # type: ignore[arg-type]
+    return max(float(h_min), min(float(h_max), longest))  # type: ignore[arg-type]
 
 
 class Places(NamedTuple):

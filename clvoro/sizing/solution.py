@@ -104,8 +104,8 @@ def hessian_size(
     p : float
         At least 1, or `math.inf`.
     h_min, h_max : float
-        Bounds. Where the Hessian is 0, h is `h_max`, by default the longest side of the box, or the radius of
-        the sphere.
+        Bounds. Where the Hessian is 0, h is `h_max`, by default and at most the longest side of the box, or 0.8 of the
+        radius of the sphere.
     at, missing
         As for `Raster`, of rasters only.
     growth : float
@@ -226,8 +226,8 @@ def gradient_size(
     n_cells : float, optional
         In place of `eps`: number of cells in the box, bounds included.
     h_min, h_max : float
-        Bounds. Where the gradient is 0, h is `h_max`, by default the longest side of the box, or the radius of
-        the sphere.
+        Bounds. Where the gradient is 0, h is `h_max`, by default and at most the longest side of the box, or 0.8 of the
+        radius of the sphere.
 
     Returns
     -------

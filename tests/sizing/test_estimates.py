@@ -199,11 +199,12 @@ def test_both_sides_of_a_layer_count(fine):
     assert made(fine.points) == pytest.approx(made.values, rel=1e-12)
 
 
-def test_sizes_on_a_sphere_do_not_exceed_its_radius(meshes):
-    """Larger ones are refused by a run."""
+@pytest.mark.parametrize("h_max", [np.inf, 1e9])
+def test_sizes_on_a_sphere_stay_below_its_radius(meshes, h_max):
+    """Larger ones are refused by a run, which scales them to a number of cells."""
     mesh = meshes["sphere"]
-    made = sizing.hessian_size(np.tanh(2 * mesh.centroids[:, 2]), on=mesh, n_cells=300, growth=10)
-    assert made.values.max() == pytest.approx(mesh.domain.radius, rel=1e-6)
+    made = sizing.hessian_size(np.tanh(2 * mesh.centroids[:, 2]), on=mesh, n_cells=300, h_max=h_max, growth=10)
+    assert made.values.max() == pytest.approx(0.8 * mesh.domain.radius, rel=1e-6)
 
 
 def test_fields_of_other_units_count_alike(fine):
