@@ -19,7 +19,7 @@ from .colors import Color, Paint, picture_of, shared_paint
 from .curves import plot_distributions, plot_history
 from .globe import default_center, map_projection, plot_globe
 from .legends import add_key
-from .solids import focus, plane_axes, plot_cutaway, plot_slice, plot_slices
+from .solids import around_body, focus, plane_axes, plot_cutaway, plot_slice, plot_slices
 from .style import WIDTH, detached, grid_height, new_figure, styled
 
 View = Literal["cells", "globe", "slices", "slice", "cutaway"]
@@ -111,7 +111,8 @@ def pictures_of(
         pictures.append(("plate", caption, whole("size", projection="plate", **plain)))
     pictures.append(("cells", f"The mesh ({name}), colored by metric error.", whole("error")))
     if solid:
-        pictures.append(("cutaway", f"A view into the mesh ({name}).", whole("error", view="cutaway")))
+        cut = {"cut": "y"} if around_body(main.diagram) else {}
+        pictures.append(("cutaway", f"A view into the mesh ({name}).", whole("error", view="cutaway", **cut)))
     if solid or len(panels) == 1:
         caption = f"The mesh ({name}), colored by cell quality; {_QUALITY[view]}."
         pictures.append(("quality", caption, whole("quality")))

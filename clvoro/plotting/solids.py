@@ -15,6 +15,7 @@ import numpy as np
 import scipy
 from matplotlib.collections import LineCollection
 from matplotlib.colors import to_rgba
+from matplotlib.patches import Patch
 from numpy.typing import ArrayLike
 
 from ..arguments import format_point
@@ -23,6 +24,7 @@ from ..geometry.domain import Domain, images_in
 from ..io.convert import cut_at_sides, missing
 from ..mesh.connectivity import following, take_rows
 from ..mesh.diagram import Diagram
+from ..mesh.faces import Faces
 from ..mesh.results import Result
 from .cells import draw_polygons, edge_widths
 from .colors import Color, Paint, paint_of, picture_of
@@ -38,6 +40,8 @@ _AXES = {"x": 0, "y": 1, "z": 2}
 _VTK_POLYHEDRON = 42
 _IN_CUT = 0.7
 """Brightness of faces in the cut, over that of faces on walls and sides of the box."""
+_IN_BOX, _NAMES = 0.5, 10
+"""Share of the sides of its bounding box that are walls of the space around a body; boundaries of it that are named."""
 
 
 def plot_slice(
@@ -193,7 +197,8 @@ def plot_cutaway(
     cut : "octant", "x", "y", "z", 3 floats, (n,) bool or None
         The removed part: the cells with generators between the point and the viewer, in all three directions;
         those in front of a plane with this normal, on the viewer's side for "x", "y" and "z"; those that are not
-        marked as kept; or nothing. Faces in the cut are darker than those on walls and sides of the box.
+        marked as kept; or nothing. Faces in the cut are darker than those on walls and sides of the box. The walls
+        of a body are shown where cells are removed around it, with a color for each boundary.
     through : 3 floats, optional
         The point; by default among the smallest cells.
     angles : (azimuth, elevation), degrees
@@ -435,6 +440,40 @@ def _on_sides(domain: Domain, polygons: list[np.ndarray]) -> np.ndarray:
     return (farthest < 1e-5 * domain.extent.max()).any(axis=(1, 2))
 
 
+def around_body(diagram: Diagram) -> bool:
+    """Return whether the domain is the space around a body: walls on most sides of its bounding box, and others."""
+    if not diagram.domain.curved_walls:
+        return False
+    faces, (x, y, z) = diagram.faces, diagram.domain.extent
+    body = _is_body(diagram, _wall_polygons(faces))
+    return bool(body.any()) and faces.area[faces.n_inner :][~body].sum() > _IN_BOX * 2 * (x * y + y * z + z * x)
+
+
+def _wall_polygons(faces: Faces) -> list[np.ndarray]:
+    starts = faces.starts[faces.n_inner : -1]
+    return np.split(faces.points[faces.corners[starts[0] :]], starts[1:] - starts[0])
+
+
+def _is_body(diagram: Diagram, polygons: list[np.ndarray]) -> np.ndarray:
+    """Return which walls are on patches that no side of the bounding box has, given their `polygons`, (f,) bool."""
+    patch = -1 - diagram.faces.neighbor[diagram.faces.n_inner :]
+    return ~np.isin(patch, patch[_on_sides(diagram.domain, polygons)])
+
+
+def _body_faces(
+    diagram: Diagram, cut: Any, through: np.ndarray, towards: np.ndarray
+) -> tuple[np.ndarray, list[np.ndarray], np.ndarray]:
+    """Return the walls of a body that face the viewer where cells are removed, as `visible_faces` does."""
+    if cut is None or not around_body(diagram):
+        return np.zeros(0, int), [], np.zeros((0, 3))
+    faces, polygons = diagram.faces, _wall_polygons(diagram.faces)
+    cells, normals = faces.owner[faces.n_inner :], faces.normal[faces.n_inner :]
+    removed = ~kept_cells(cut, through, towards, cells, diagram.points[cells])
+    seen = np.flatnonzero(removed & _is_body(diagram, polygons) & (normals @ towards < 0))
+    seen = seen[np.argsort((faces.center[faces.n_inner :] @ towards)[seen], kind="stable")]
+    return cells[seen], [polygons[k] for k in seen], normals[seen]
+
+
 def _draw_cutaway(
     ax: Any,
     diagram: Diagram,
@@ -448,7 +487,12 @@ def _draw_cutaway(
     """Add the view to `ax`: the faces of the kept cells that are seen, and the edges of the box."""
     right, up, towards = view_axes(angles)
     screen = np.stack([right, up], axis=1)
-    cells, polygons, normals = visible_faces(diagram, _cut(cut, len(diagram), towards), through, towards)
+    cut = _cut(cut, len(diagram), towards)
+    body = _body_faces(diagram, cut, through, towards)
+    cells, polygons, normals = (
+        np.concatenate(parts) if isinstance(parts[0], np.ndarray) else [*parts[0], *parts[1]]
+        for parts in zip(visible_faces(diagram, cut, through, towards), body, strict=True)
+    )
     flat = [polygon @ screen for polygon in polygons]
     corners = np.stack(np.meshgrid(*np.transpose([diagram.domain.lower, diagram.domain.upper])), axis=-1).reshape(-1, 3)
     pairs = [(a, b) for i, a in enumerate(corners) for b in corners[i + 1 :] if np.count_nonzero(a != b) == 1]
@@ -458,14 +502,22 @@ def _draw_cutaway(
     frame_domain(ax, lower - margin, upper + margin)
     ax.set_axis_off()
     ax.add_collection(LineCollection(list(frame), colors="#B0B0B0", linewidths=0.6, zorder=0))
-    shade = brightness(normals, angles)
+    of_body = np.arange(len(polygons)) >= len(polygons) - len(body[0])
+    shade = brightness(np.where(of_body[:, None], -normals, normals), angles)
     widths, colors = edge_widths(ax, flat) if edges else np.zeros(len(flat)), paint.rgba(cells)
     wall = _walls_of(diagram, polygons) if polygons else np.zeros(0, int)
     if polygons:
-        shade[(wall < 0) & ~_on_sides(diagram.domain, polygons)] *= _IN_CUT
+        shade[(wall < 0) & ~of_body & ~_on_sides(diagram.domain, polygons)] *= _IN_CUT
+    hues = np.array([to_rgba(color) for color in METHOD_COLORS])
     if walls:
-        hues = np.array([to_rgba(color) for color in METHOD_COLORS])
         colors[wall >= 0] = 0.5 + 0.5 * hues[wall[wall >= 0] % len(hues)]
+    elif of_body.any():
+        seen, number = np.unique(diagram.domain.boundary_index[wall[of_body]], return_inverse=True)
+        hues = 0.3 + 0.7 * hues
+        colors[of_body] = hues[number.reshape(-1) % len(hues)]
+        names = [diagram.domain.boundary_names[k] for k in seen[:_NAMES]]
+        keys = [Patch(color=hues[k % len(hues)], label=name) for k, name in enumerate(names)]
+        ax.legend(handles=keys, loc="upper left", fontsize=8, frameon=False)
     draw_polygons(ax, cells, flat, paint, widths, light=shade, colors=colors)
 
 

@@ -10,7 +10,7 @@ from matplotlib.collections import PolyCollection
 from matplotlib.path import Path
 from scipy.spatial import cKDTree
 
-from clvoro import Adapter, Box
+from clvoro import Adapter, Box, Solid
 from clvoro.errors import ClvoroError, InputError, MissingPicturesWarning
 from clvoro.plotting import (
     page,
@@ -23,7 +23,7 @@ from clvoro.plotting import (
     plot_slices,
     write_report,
 )
-from clvoro.plotting.solids import VIEW, cut_cells, focus, kept_cells, plane_axes, view_axes, visible_faces
+from clvoro.plotting.solids import VIEW, around_body, cut_cells, focus, kept_cells, plane_axes, view_axes, visible_faces
 from tests.reference import solids
 
 LOWER, UPPER = (-1.0, 0.0, 2.0), (1.0, 1.0, 3.5)
@@ -305,6 +305,20 @@ def test_faces_in_a_cut_are_darker(ctx, periodic):
         (faces,) = (c for c in ax.collections if isinstance(c, PolyCollection))
         brightest.append(faces.get_facecolor()[:, 1].max())
     assert brightest[1] < 0.8 * brightest[0]
+
+
+def test_a_body_is_seen_where_cells_around_it_are_removed(ctx):
+    body = Solid.box((-0.5, -0.5, -0.5), (0.5, 0.5, 0.5))
+    air = Solid.outside(body, ((-2, -2, -2), (2, 2, 2)))
+    at = np.arange(-5, 6, 2) / 3 + 0.01
+    points = np.stack(np.meshgrid(at, at, at), axis=-1).reshape(-1, 3)
+    d = Adapter(ctx).diagram(air, points[np.abs(points).max(axis=1) > 0.5])
+    assert around_body(d)
+    ax = plot_cutaway(d, np.ones(len(d)), cut="y", through=(0, 0, 0)).axes[0]
+    # The viewer is beyond xMax, yMin and zMax.
+    assert [t.get_text() for t in ax.get_legend().get_texts()] == ["body-xMax", "body-yMin", "body-zMax"]
+    assert plot_cutaway(d, np.ones(len(d)), cut=None).axes[0].get_legend() is None
+    assert not around_body(Adapter(ctx).diagram(body, points[np.abs(points).max(axis=1) < 0.5]))
 
 
 def test_without_pyvista(result, tmp_path, monkeypatch):

@@ -19,7 +19,7 @@ _FLAT = 1e-3  # of the extent of a hole: how far it may deviate from a plane
 _APART = 1e-6  # of the diagonal: how far from a triangle its two sides are examined
 _LARGEST_GAP = 1e-3  # of the diagonal: gaps that `join` may close
 _SHARPEST = 10.0  # degrees
-_OR_WRAP = "Or pass wrap=, of about half a cell: a closed surface around what is there"
+_OR_WRAP = "Or pass wrap=, two thirds of the size of cells, for a closed surface around all triangles"
 
 
 def closing_distance(surface: Surface) -> float | None:

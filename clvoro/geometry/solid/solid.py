@@ -156,7 +156,7 @@ class Solid(Domain):
         Take a closed surface around all triangles in their place, whatever is wrong with them. It is about wrap / 2
         outside of them, and closes holes and gaps up to 2 wrap wide; sheets become plates as thick as `wrap`. What is
         finer is left out, with sharp edges and groups. A warning says how far the surface is from the triangles at
-        most. It suits cells of twice this size, or smaller ones.
+        most. It suits cells of 1.5 wrap, or smaller ones.
 
     Attributes
     ----------
@@ -623,6 +623,15 @@ class Solid(Domain):
         used, index = np.unique(group, return_inverse=True)
         names = tuple(self._group_names[g] for g in used.tolist())
         return BoundaryNames(names, index.reshape(-1).astype(np.int32), "patch")
+
+    def why_sizes_are_missed(self, x: np.ndarray, h: float, cells: int) -> str:
+        """Return why the cell at `x` (3,) of a mesh of `cells` has not the size `h`, where sizes vary little."""
+        if self.feet(x[None], h).triangle[0] < 0:
+            return super().why_sizes_are_missed(x, h, cells)
+        return (
+            "walls and creases there are as near to each other as cells are wide: use smaller sizes there, as "
+            "sizing.gap_size and sizing.curvature_size do, or leave out such details by wrap="
+        )
 
     @property
     def plain(self) -> bool:
