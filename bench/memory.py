@@ -36,7 +36,7 @@ from clvoro.remapping.device_transfer import transfer_bytes
 from clvoro.remapping.pieces import Pieces
 
 PACKAGE = Path(clvoro.__file__).parent
-PLUMBING = {"device_array", "engine", "primitives", "program"}
+PLUMBING = {"device_array", "engine", "memory_limits", "primitives", "program"}
 """Modules that allocate buffers for others."""
 
 

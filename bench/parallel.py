@@ -13,14 +13,17 @@ between pairs of ranks, and of sums over all ranks, per step in which all ranks 
 same time; `waits` counts how often a rank waits for others. `ghosts` is the number of ghosts of rank 0 in the last
 diagram over 2 d (n / p)^((d - 1) / d), an estimate of one layer of cells around a part. `one round` is the share of
 diagrams whose cells were made once, since no ghosts were missing, and `asked` how often ranks asked each other for
-ghosts, over the number of diagrams. Needs `pip install -e '.[mpi]'`.
+ghosts, over the number of diagrams. `memory` is the largest device memory of a rank, in the run and while its cells
+are read, over that of the first number of ranks. Needs `pip install -e '.[mpi]'`.
 """
 
 from __future__ import annotations
 
 import argparse
+import gc
 import hashlib
 import json
+import os
 import sys
 import time
 
@@ -30,6 +33,7 @@ from _kinds import COAST
 
 import clvoro
 from clvoro.adaptation.run import Run
+from clvoro.opencl import memory_limits
 from clvoro.tessellation.part_steps import PartSteps
 
 COLUMNS = {
@@ -48,6 +52,7 @@ COLUMNS = {
     "ghosts": shown("ghosts", ".2f"),
     "one round": shown("one_round", ".0%"),
     "asked": shown("asked", ".0%"),
+    "memory": shown("memory", ".3f"),
 }
 
 
@@ -55,6 +60,7 @@ def measure_rank(options: argparse.Namespace) -> None:
     """Print the figures of all ranks as JSON, on rank 0."""
     from mpi4py import MPI
 
+    os.environ.setdefault(memory_limits.VARIABLE, "1024GiB")  # the memory is counted
     dim, cells, effort, comm = options.rank, options.cells, options.effort, MPI.COMM_WORLD
     rounds, ghosts, asked, box = [], [0], [0], clvoro.Box((0,) * dim, (1,) * dim, periodic=options.periodic)
     domain = clvoro.Sphere(0.5) if options.sphere else COAST if options.polygon else box
@@ -97,11 +103,16 @@ def measure_rank(options: argparse.Namespace) -> None:
     run(adapter, 4 * h)  # builds kernels
     single = clvoro.Adapter(adapter.ctx, options.dtype, comm=MPI.COMM_SELF)
     run(single, 4 * h)
-    _, least = run(single, h * comm.size ** (1 / dim))
+    least = run(single, h * comm.size ** (1 / dim))[1]
     rounds.clear()
     calls.clear()
     asked[0] = 0
+    del whole, single
+    gc.collect()
+    memory_limits.MOST_TAKEN.clear()
     mesh, spent = run(adapter, h)
+    _ = mesh.diagram.vertices
+    taken = comm.allreduce(max(memory_limits.MOST_TAKEN.values()), MPI.MAX)
     steps = int(mesh.history["step"][-1])
     per_part = mesh.history["cells"][-1] / comm.size
     layer = 2 * dim * per_part ** ((dim - 1) / dim)
@@ -122,6 +133,7 @@ def measure_rank(options: argparse.Namespace) -> None:
             "waits": waits / done,
             "ghosts": ghosts[0] / layer,
             "one_round": float(np.mean(np.array(rounds) == 1)) if comm.size > 1 else 1.0,
+            "taken": taken,
             "asked": asked[0] / len(rounds) if comm.size > 1 else 0.0,
         }
         print(json.dumps(figures))
@@ -150,6 +162,7 @@ def main() -> None:
             first = first or record
             bits = "same" if record["digest"] == first["digest"] else "differ"
             ratios = {"over_one": record["cpu"] / first["cpu"], "floor": record["least"] / first["least"]}
+            ratios["memory"] = record["taken"] / first["taken"]
             table.add(record | {"bits": bits, **ratios})
         table.finish(f"Ranks {'on a sphere' if options.sphere else f'in {dim}D'}, effort {options.effort}")
 

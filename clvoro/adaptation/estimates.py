@@ -24,21 +24,22 @@ MAX_CELLS = 100_000_000
 """Limit of the 32-bit indices into rows of neighbors."""
 MAX_LABELS = 2_000_000_000
 """Limit of the permanent numbers of generators, which are unique among all parts."""
-GHOST_LAYERS = {2: 2.8, 3: 2.2}
-"""Depth of the layer of ghosts around a part, divided by the size of cells; see `clvoro.tessellation.part_steps`."""
+GHOST_LAYERS = {2: 4.5, 3: 0.8}
+"""Depth of the layer of ghosts around a part that take as much memory as cells, divided by the size of cells. In 3D
+ghosts have cells only while the mesh is read, and only those beside cells of the part."""
 SIZES = {
     "plane": {"run": (26, 86), "diagram": (65, 45), "power run": (74, 119), "power diagram": (75, 92)},
     "cut": {"run": (68, 79), "diagram": (94, 90), "power run": (171, 134), "power diagram": (125, 130)},
     "curved": {"run": (33, 90), "diagram": (70, 82), "power run": (88, 138), "power diagram": (70, 82)},
-    "space": {"run": (150, 400), "diagram": (325, 525), "power run": (170, 355), "power diagram": (300, 575)},
+    "space": {"run": (108, 378), "diagram": (230, 515), "power run": (170, 355), "power diagram": (235, 515)},
 }
 """Reals and 32-bit integers per cell at the peak of a run, or of one diagram of random generators, and while all arrays
 are read. By the kind of cells: in boxes in 2D, cut by a boundary, on a sphere, in 3D (bench/memory.py)."""
-FOLDED = {"plane": dict.fromkeys(SIZES["plane"], 0.5), "space": {"diagram": 0.5, "power diagram": 1.5}}
+FOLDED = {"plane": dict.fromkeys(SIZES["plane"], 0.5), "space": {"diagram": 0.5, "power diagram": 0.5}}
 """What is added per cell (not per image) in periodic boxes, as a share of `SIZES`."""
 CELLS_PER_BOUNDARY_CELL, CELLS_PER_EDGE = 1.5, 0.3
 """As many cells take as much as a cell at a boundary that cuts cells takes in addition, and as an edge of it."""
-CELLS_PER_WALL_CELL = 1.5
+CELLS_PER_WALL_CELL = 2.5
 """As many cells take as much as a cell at the surface of a solid takes in addition: above all the generator outside of
 it when the mesh is read."""
 BYTES_PER_PRISM = 4000

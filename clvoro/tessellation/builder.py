@@ -19,6 +19,8 @@ from .weight_bounds import WeightBounds
 
 MOMENTS = {2: 3, 3: 6}
 """Second moments of a cell, by its dimension."""
+MOST_ROOM = 1.1
+"""Largest room for cells over their number, in a part: it has far fewer of them when others join the run."""
 
 
 class CellBuilder(ABC):
@@ -47,7 +49,8 @@ class CellBuilder(ABC):
     def cells_of(self, n: int) -> dict[str, cla.Array]:
         """Return the arrays per cell of a diagram of `n` cells."""
         engine = self.engine
-        if not self._all_cells or self._all_cells["volumes"].shape[0] < n:
+        room = self._all_cells["volumes"].shape[0] if self._all_cells else -1
+        if not n <= room <= (MOST_ROOM * n if engine.peers.shared else room):
             self.clear()  # the old arrays are freed first
             self._all_cells = {
                 "starts": engine.empty(n + 1, np.int32),

@@ -163,6 +163,12 @@ class Part:
         n = len(points) if n is None else n
         return cls(n, n, points, box)
 
+    def in_order(self, engine: Engine, rows: np.ndarray) -> Part:
+        """Return the part with its `rows` (count,) in this order."""
+        assert self.labels is not None
+        points, labels = (engine.upload(array.get()[rows], array.dtype) for array in (self.points, self.labels))
+        return replace(self, points=points, labels=labels)
+
     @property
     def peers(self) -> Peers | None:
         """The other parts of the domain, if there are any."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from copy import copy as shallow_copy
+from dataclasses import replace
 from functools import cached_property
 from typing import TYPE_CHECKING, cast
 
@@ -162,6 +163,16 @@ def kept_faces(t: Tessellation, m: int, copy: bool) -> Tessellation:
         covariances=t.covariances,
         round_off=t.round_off,
     )
+
+
+def on_host(array: cla.Array | np.ndarray) -> np.ndarray:
+    """Return an array that may be on the device."""
+    return array if isinstance(array, np.ndarray) else array.get()
+
+
+def faces_on_host(t: Tessellation) -> Tessellation:
+    """Return `t` with measures and centroids of faces as NumPy arrays."""
+    return replace(t, **{name: on_host(getattr(t, name)) for name in ("face_measures", "face_centroids")})
 
 
 def merge_ends(corners: np.ndarray, starts: np.ndarray, dropped: np.ndarray) -> np.ndarray:
@@ -328,6 +339,10 @@ class _DiagramReader:
         InputError
             If round-off has made cells wrong.
         """
+        # The device needs their memory.
+        whole, self.t = self.whole, faces_on_host(self.t)
+        self.whole = self.t if self.codes is None else faces_on_host(whole)
+        del whole
         try:
             faces = share_faces(self.engine, self.box, self.whole)
             trial = shallow_copy(self)
@@ -357,7 +372,7 @@ class _DiagramReader:
         other, points = t.neighbors.get()[faces], t.sites.get()[:, : self.engine.dim].astype(float)
         inner = other >= 0  # faces on walls are never below round-off
         way = np.linalg.norm(points[other] - points[cell], axis=1) * inner
-        return np.bincount(cell, t.face_measures.get()[faces] * way / 6, t.n)
+        return np.bincount(cell, on_host(t.face_measures)[faces] * way / 6, t.n)
 
     def _in_whole(self, faces: np.ndarray) -> np.ndarray:
         """Return the indices in `whole` of faces on the device."""
@@ -414,10 +429,10 @@ class _DiagramReader:
         """Return an array of cells in physical units."""
         return self._physical(np.take(array.get(), self.order, axis=0), power)
 
-    def _read_faces(self, array: cla.Array) -> np.ndarray:
+    def _read_faces(self, array: cla.Array | np.ndarray) -> np.ndarray:
         """Return an array of faces."""
-        if self.lists is None:
-            return np.take(array.get(), self.slots, axis=0)
+        if self.lists is None or isinstance(array, np.ndarray):
+            return np.take(on_host(array), self.slots, axis=0)
         return Gather(self.engine).lists(self.lists, array).get()
 
     def _physical(self, numbers: np.ndarray, power: int = 1) -> np.ndarray:

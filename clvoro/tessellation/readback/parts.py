@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pyopencl.array as cla
 
+from ...errors import InputError
 from ...geometry.box import Box
 from ...geometry.domain import Domain
 from ...mesh.diagram import Diagram
@@ -29,25 +30,39 @@ def fetch_part(engine: Engine, domain: Domain, t: Tessellation, labels: cla.Arra
         return fetch_diagram(engine, domain, t, labels, copy=False, held=held)
     (n, part, whole), own = (t.n, t.part, t.whole), labels.get()[: t.n]
     points = fetch_diagram(engine, unfolded(domain), replace(t, part=None), labels, copy=False).points
+    names = np.array([f"rank{number}" for number in part.ghosts.parts] if part.ghosts else [], object)
+    ghosts = np.arange(n, part.count)
+    beside = np.isin(ghosts, t.neighbors.get()[: int(t.starts[n].get())]) if whole is None else ghosts >= n
 
     def read_all() -> Diagram:
         rows = CellRows.of(t, labels).gather(ALONE)
         assert rows is not None
         return rows.diagram(engine, domain)
 
-    def read() -> Diagram:
-        # Cells share vertices with those of ghosts.
-        made, places, names = whole, np.arange(part.count, dtype=np.int32), np.full(part.count, "", object)
+    def read_with(beside: np.ndarray) -> Diagram:
+        """Cells share vertices with those of the ghosts `beside` them, (g,) bool."""
+        rows = np.concatenate([np.arange(n), ghosts[beside], ghosts[~beside]])
+        made, count = whole, n + np.count_nonzero(beside)
+        there = part if whole is not None else part.in_order(engine, rows)
         if made is None:
             stages = TessellationStages(engine)
-            binned = stages.bins.build(part.box, part.points, part.count)
-            made = stages.cells.tessellate(part, binned, exact=False)
-        places[order_of(own)] = np.arange(n)
-        assert part.ghosts is not None
-        names[n:] = [f"rank{number}" for number in part.ghosts.parts]
-        numbers, made = engine.upload(places, np.int32), replace(made, part=part)
+            binned = stages.bins.build(there.box, there.points, there.count)
+            made = replace(stages.cells.tessellate(there, binned, exact=False, rows=count), vertices=())
+            del binned
+            stages.release()
+        places, boundary = np.arange(count, dtype=np.int32), np.full(count, "", object)
+        places[order_of(own)], boundary[n:] = np.arange(n), names[beside]
+        made, numbers = replace(made, part=there), engine.upload(places, np.int32)
         diagram = fetch_diagram(engine, unfolded(domain), made, numbers, copy=False)
-        return take_subset(diagram, np.arange(part.count) < n, names)
+        del made
+        return take_subset(diagram, np.arange(count) < n, boundary)
+
+    def read() -> Diagram:
+        try:
+            return read_with(beside)
+        except InputError:
+            # Where round-off may have spoiled cells, those of all ghosts fill the domain.
+            return read_with(ghosts >= n)
 
     return _LaterDiagram(points, read_all if (part.peers or ALONE).count == 1 else read)
 

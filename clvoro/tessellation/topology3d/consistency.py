@@ -86,10 +86,9 @@ class FaceSharing:
         self.merged = False
         self.labels = f.same.copy()
         self.name_vertices(f.same.copy())
-        self.twins, self.counts = (engine.empty(self.h, np.int32) for _ in range(2))
+        self.twins = engine.empty(self.h, np.int32)
         engine.run_each(self._kernels.find_twins, t.n, t.starts, f.starts, f.labels, self.twins)
         self.differs = engine.empty(self.h, np.uint8)
-        self.reduced = engine.empty(len(f.loops), np.int32)
 
     def run(self) -> SharedFaces:
         """Return the faces once their half-faces are identical."""
@@ -119,6 +118,7 @@ class FaceSharing:
     def compare(self) -> bool:
         """Reduce all loops; return whether any half-face differs from its twin."""
         f, k, any_ = self.half_faces, self._kernels, self.engine.zeros(1, np.int32)
+        self.reduced, self.counts = (self.engine.empty(size, np.int32) for size in (len(f.loops), self.h))
         self.engine.run_each(k.reduce_loops, self.h, f.loop_starts, f.loops, self.labels, self.reduced, self.counts)
         self.engine.run_each(
             k.compare_half_faces, self.h, self.twins, f.loop_starts, self.reduced, self.counts, self.differs, any_
@@ -134,6 +134,7 @@ class FaceSharing:
     def merge(self, doublings: int) -> bool:
         """Merge vertices of half-faces that differ, within a tolerance; return whether there were any to merge."""
         engine, f, k, c = self.engine, self.half_faces, self._kernels, self.c
+        del self.reduced, self.counts  # they are made again
         distances = engine.empty(c, np.uint32).fill(2**32 - 1)
         targets = engine.empty(c, np.int32).fill(_LARGEST)
         for second_pass in (0, 1):
@@ -151,6 +152,7 @@ class FaceSharing:
                 distances,
                 targets,
             )
+        del distances
         rejected, any_ = engine.zeros(c, np.int32), engine.zeros(1, np.int32)
         engine.run_each(k.reject_targets, c, *self._vertices, targets, np.int32(doublings), rejected)
         labels = self.labels.copy()
@@ -158,7 +160,7 @@ class FaceSharing:
         if not int(any_[0].get()):
             return False
         self.merged = True
-        del distances, targets, rejected
+        del targets, rejected
         self.name_vertices(labels)
         return True
 
