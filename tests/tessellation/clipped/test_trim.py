@@ -270,6 +270,16 @@ def test_a_rectangle_is_a_box(adapters, real):
     assert np.abs(ours.volumes - theirs.volumes).max() < 16 * eps
     # Corners that cells share with a corner of the domain: one side more or less.
     assert np.abs(np.diff(ours.neighbor_starts) - np.diff(theirs.neighbor_starts)).max() == 0
+    moments = []
+    for domain, straight in ((clvoro.Box(lower, upper), False), (polygon, False), (polygon, True)):
+        stages, scale = adapters[real]._stages_for(domain), domain.frame[1]
+        x = stages.engine.upload(domain.place(points, stages.engine.real))
+        t = Tessellator(stages, domain, straight=straight).tessellate(x, len(points))
+        firsts, seconds = t.offsets.get().reshape(-1, 2) * scale, t.covariances.get().reshape(-1, 3) * scale**2
+        moments.append(np.hstack([firsts, seconds]))
+    differ = (np.abs(moments[1:] - moments[0]) > 64 * eps).any(axis=2).sum(axis=1)
+    assert differ[0] == 0
+    assert differ[1] <= 4  # straight sides may cut corners
 
 
 def read(stages, domain, t):
