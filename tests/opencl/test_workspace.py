@@ -12,7 +12,7 @@ from clvoro.adaptation.methods import ProjectedMethod, PublishedMethod, Relaxati
 from clvoro.adaptation.stages import Stages
 from clvoro.adaptation.state import MeshState
 from clvoro.errors import MemoryLimitError
-from clvoro.opencl import memory_limits
+from clvoro.opencl import memory_limits, primitives
 from clvoro.opencl.engine import Engine
 from clvoro.opencl.workspace import MOST_VIEWS, SMALL, SPARE
 from tests.reference import patch
@@ -195,8 +195,9 @@ def test_steps_allocate_nothing(engine, made, method):
 
 
 @pytest.mark.slow
-def test_search_for_flaws_frees_its_memory(engine, made):
-    """Memory of the search is freed before the next diagram."""
+def test_search_for_flaws_frees_its_memory(engine, made, monkeypatch):
+    """Memory of the search is freed before the next diagram, if it is not small."""
+    monkeypatch.setattr(primitives, "KEPT", 0)
     size = sizing.Sizing(engine, patch.BOX, sizing.Constant(0.05))
     points = engine.upload(patch.relaxed_points(1200, 3) / patch.BOX.frame[1])
     mesh = MeshState.create(Stages(engine), patch.BOX, size, points)
