@@ -224,6 +224,13 @@ def builtin_cases() -> Mapping[str, str]:
     return {path.stem: path.read_text(encoding="utf-8") for path in files}
 
 
+GEOMETRIES = {
+    **dict.fromkeys((".json", ".geojson"), "polygon"),
+    **dict.fromkeys((".stl", ".obj", ".ply", ".off", ".3mf", ".step", ".stp"), "solid"),
+}
+"""Suffixes of files that a case names, and the key below [domain] that does."""
+
+
 def load_case(name: str | Path) -> Case:
     """Return the case of a built-in name or of a TOML file.
 
@@ -236,6 +243,11 @@ def load_case(name: str | Path) -> Case:
     if str(name) in known:
         return Case.from_toml(known[str(name)], str(name))
     path = Path(name)
+    if key := GEOMETRIES.get(path.suffix.lower()):
+        raise InputError(
+            f"{str(name)!r} is a geometry, expected a case: write a file .toml with {key} = {path.name!r} below "
+            "[domain], and a table [size]; `clvoro cases lake` prints one to start from"
+        )
     try:
         text = read_text(path, LONGEST)
     except (OSError, UnicodeDecodeError) as error:
