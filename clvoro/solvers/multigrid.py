@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 _COARSEST = 64
 """Cells of the coarsest level, at most, if it is solved exactly."""
-GATHERED = 5000
+GATHERED = 30_000
 """Largest number of cells, over all parts, of a level that each part holds whole: all parts then do the same work."""
 _MAX_LEVELS = 30
 _LEAST_COARSENING = 0.8
