@@ -48,7 +48,10 @@ LIMITS = {
     "list_corners": (288, 4608),
     "find_loops": (176, 256),
     "walk_edges": (176, 64),
+    "find_own_planes": (160, 768),
+    "fit_quadratics": (192, 640),
     "fit_slopes": (224, 4608),
+    "order_rows": (144, 5632),
     "transfer_cell_data": (224, 6144),
 }
 """The same for kernels that take more. No variant of any kernel spills registers."""
