@@ -30,7 +30,7 @@
 #define AREA_NOISE (IS_DOUBLE ? R(1e-9) : R(1e-4))
 
 /* Add the plane of a neighbor or wall to the cell of a generator at x. */
-inline void add_plane(corners_t *cell, int label, REAL4 x, const rows_t *in)
+inline void add_plane(CORNERS *cell, int label, REAL4 x, const rows_t *in)
 {
     const int f = cell->faces++;
     cell->labels[f] = label;
@@ -39,7 +39,7 @@ inline void add_plane(corners_t *cell, int label, REAL4 x, const rows_t *in)
 
 /* Start with the planes of the previous neighbors of generator i at x, and of further ones in ascending order. Returns
    the number of the former; -1 if there is no room, or the cell is to be clipped. */
-inline int list_planes(corners_t *cell, int i, REAL4 x, global const int *further, const rows_t *in)
+inline int list_planes(CORNERS *cell, int i, REAL4 x, global const int *further, const rows_t *in)
 {
     const int start = in->starts[i], n = in->starts[i + 1] - start;
     cell->faces = 0;
@@ -68,7 +68,7 @@ inline int list_planes(corners_t *cell, int i, REAL4 x, global const int *furthe
 }
 
 /* The set of the walls that the cell of a generator at x crosses, one bit each. */
-inline uint crossed_walls(private const corners_t *cell, REAL4 x, const rows_t *in)
+inline uint crossed_walls(const CORNERS *cell, REAL4 x, const rows_t *in)
 {
     const REAL reach = sqrt(cell->reach2), noise = WALL_NOISE(reach);
     uint crossed = 0;
@@ -93,7 +93,7 @@ inline uint crossed_walls(private const corners_t *cell, REAL4 x, const rows_t *
 
 /* Keep the cell of generator i at x within the walls: those that it does not have become further neighbors. True if
    there is none, and all walls near the cell are known. */
-inline bool keep_in_walls(private const corners_t *cell, int i, REAL4 x, const rows_t *in, global int *marks)
+inline bool keep_in_walls(const CORNERS *cell, int i, REAL4 x, const rows_t *in, global int *marks)
 {
     if (!knows_walls(i, cell->reach2, &in->own))
         return false;
@@ -158,7 +158,7 @@ inline bool number_faces(CORNERS *cell, const uint *next)
 /* Write the keys that neighbors are compared with: for each face the sum, over its vertices, of the products of the
    hashes of the two other faces there. Returns the set of the faces whose keys differ from the `n` previous ones; these
    faces were in the same order. */
-inline uint write_keys(const corners_t *cell, int place, global uint *keys, int n, global const int *old_labels,
+inline uint write_keys(const CORNERS *cell, int place, global uint *keys, int n, global const int *old_labels,
                        global const uint *old_keys)
 {
     uint hashes[MOST_FACES], sums[MOST_FACES];
@@ -185,8 +185,7 @@ inline uint write_keys(const corners_t *cell, int place, global uint *keys, int 
 
 /* Make the faces with a new edge between them neighbors. Bit b of old[a], next[a]: there was, is an edge between faces
    a and b. */
-inline void join_new_edges(const corners_t *cell, const uint *old, const uint *next, const rows_t *in,
-                           global int *marks)
+inline void join_new_edges(const CORNERS *cell, const uint *old, const uint *next, const rows_t *in, global int *marks)
 {
     for (int a = 0; a < cell->faces; ++a)
         for (uint rest = next[a] & ~old[a]; rest; rest &= rest - 1)

@@ -41,7 +41,7 @@ typedef struct {
     WIDE square, level, inverse, tension;
 } side_t;
 
-inline void gather_side(side_t *side, const sides_t *sides, const int *k)
+inline void gather_side(side_t *side, private const sides_t *sides, const int *k)
 {
     gather_lanes(&side->away, &side->square, sides->away, k);
     side->level = GATHER_WIDE(sides->level, k);
@@ -70,7 +70,7 @@ inline void add_pull(places_t *sum, const side_t *a, const side_t *b, const plac
 }
 
 /* The sum of K integral (p - x_i) dl over the edges of a cell with these vertices, as triples of faces. */
-inline REAL4 pull_of_edges(const sides_t *sides, global const uchar4 *corners, int count, REAL own)
+inline REAL4 pull_of_edges(private const sides_t *sides, global const uchar4 *corners, int count, REAL own)
 {
     places_t sums[HALVES];
     for (int turn = 0; turn < HALVES; ++turn)
