@@ -414,7 +414,7 @@ class PartSteps(DomainSteps):
         if self._cut is None:
             places = self.domain.place(self.domain.landmarks, self.stages.engine.real)
         else:
-            places = self._cut.landmarks()
+            places = self._cut.landmarks
         if not len(places):
             return
         nearest = np.full((len(places), 2), np.inf)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import cached_property
 
 import numpy as np
 import pyopencl as cl
@@ -67,8 +68,9 @@ class Cut(DomainSteps):
         """The ghost generators in the device's coordinates, (g, 2)."""
         return self._ghosts
 
+    @cached_property
     def landmarks(self) -> np.ndarray:
-        """Return places (k, 2) along the boundary and all over the domain, in the device's coordinates.
+        """Places (k, 2) along the boundary and all over the domain, in the device's coordinates.
 
         All parts of a mesh know the generators nearest to them: so each can trace the whole boundary. Far from its own
         cells it traces cells that are nearly right, which is enough.
