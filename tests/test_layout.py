@@ -79,7 +79,7 @@ PARTS = {
     "tessellation.polyhedra_update": {"tessellation.polyhedra"},
 }
 """Modules with kernels that use the kernels of others."""
-RETURN_TOGETHER = {"tessellation/polyhedra_by_teams", "tessellation/polyhedra_update_by_teams"}
+RETURN_TOGETHER = {"tessellation/polyhedra_by_teams"}
 """Files of kernels whose work-groups return as one, from any place; see tessellation/team.h."""
 
 

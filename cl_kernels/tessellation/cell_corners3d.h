@@ -1,14 +1,9 @@
 /* A cell in 3D as the vertices of its planes: a vertex is a triple of faces, counter-clockwise seen from outside. It
-   lies in private or global memory; or, if a team updates it, in local memory. */
+   lies in private or global memory. */
 #include "tessellation/corner_shares.h"
 
-#ifdef TEAM
-#define CORNER_SPACE local
-#else
-#define CORNER_SPACE LANE_SPACE
-#endif
-#define CORNERS CORNER_SPACE corners_t
-#define LINKS CORNER_SPACE links_t
+#define CORNERS LANE_SPACE corners_t
+#define LINKS LANE_SPACE links_t
 #define NO_CORNER 255
 
 typedef struct {
@@ -22,7 +17,7 @@ typedef struct {
 } corners_t;
 
 /* The numbers in vectors of WIDTH. */
-#define NUMBERS(vectors) ((CORNER_SPACE REAL *)(vectors))
+#define NUMBERS(vectors) ((LANE_SPACE REAL *)(vectors))
 
 /* Where two faces are consecutive at a vertex: its number, [a][b]. */
 typedef struct {
@@ -40,5 +35,4 @@ inline REAL4 corner_place(const CORNERS *cell, int v)
     return (REAL4)(NUMBERS(cell->x)[v], NUMBERS(cell->y)[v], NUMBERS(cell->z)[v], 0);
 }
 
-#define CORNER_PLACE corner_place
 #include "tessellation/corner_measures.h"

@@ -116,7 +116,7 @@ inline bool flip_corners(CORNERS *cell, LINKS *links)
 {
     for (int flips = 0; flips < MOST_FLIPS; ++flips) {
         int worst = 0;
-        CORNER_SPACE const REAL *beyond = NUMBERS(cell->beyond);
+        LANE_SPACE const REAL *beyond = NUMBERS(cell->beyond);
         for (int v = 1; v < cell->corners; ++v)
             worst = beyond[v] > beyond[worst] ? v : worst;
         if (!(beyond[worst] > BEYOND_NOISE))
@@ -159,7 +159,7 @@ inline bool repair_corners(CORNERS *cell, LINKS *links, int known)
     for (int f = known; f < end && right; ++f) {
         const REAL4 plane = planes[f - known];
         cell->planes[f].xyz = plane.xyz;
-        CORNER_SPACE REAL *beyond = NUMBERS(cell->beyond);
+        LANE_SPACE REAL *beyond = NUMBERS(cell->beyond);
         REAL most = BEYOND_NOISE;
         int worst = -1;
         for (int v = 0; v < cell->corners; ++v) {

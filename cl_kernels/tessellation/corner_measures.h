@@ -1,5 +1,4 @@
-/* Areas and centroids of the faces of a cell in 3D, and its moments, from the shares of its vertices. CORNERS is the
-   type of the cell: it has `corners` vertices, each the triple `at` of faces, at CORNER_PLACE(cell, v). */
+/* Areas and centroids of the faces of a cell in 3D, and its moments, from the shares of its vertices. */
 #include "tessellation/corner_shares.h"
 
 /* Area and centroid of a face from triangles around its first vertex: as accurate as the vertices, also for small
@@ -18,14 +17,14 @@ inline REAL4 measure_flat(const CORNERS *cell, int f, REAL4 normal, bool *wide)
         at[n] = v;
         n += faces.s0 == f || faces.s1 == f || faces.s2 == f;
     }
-    const REAL4 first = CORNER_PLACE(cell, at[0]);
+    const REAL4 first = corner_place(cell, at[0]);
     REAL4 before = 0, sum = 0;
     REAL twice = 0, far2 = dot(first, first), width2 = 0;
     for (int k = 0, steps = 1; steps < n; ++steps) {
         int next = 0;
         while (next < n - 1 && ins[next] != outs[k])
             ++next;
-        const REAL4 y = CORNER_PLACE(cell, at[next]), after = y - first;
+        const REAL4 y = corner_place(cell, at[next]), after = y - first;
         far2 = fmax(far2, dot(y, y));
         width2 = fmax(width2, dot(after, after));
         const REAL weight = dot(normal, cross(before, after));

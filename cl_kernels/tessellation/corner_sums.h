@@ -14,7 +14,7 @@ typedef struct {
     REAL4 faces[MOST_FACES];
     WIDE xx[HALVES], yy[HALVES], zz[HALVES], yz[HALVES], zx[HALVES], xy[HALVES];
 } sums_t;
-#define SUMS CORNER_SPACE sums_t
+#define SUMS LANE_SPACE sums_t
 
 /* Find the vertices and sum them up. False if faces at a vertex are nearly parallel or not counter-clockwise, or a
    neighbor is very near. `reach2` and `beyond` are set. The sums are incomplete if a vertex lies beyond another face,

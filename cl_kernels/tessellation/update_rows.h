@@ -1,4 +1,4 @@
-/* Cells in 3D that are updated, alone or by teams; see polyhedra_update.cl. */
+/* Cells in 3D that are updated; see polyhedra_update.cl. */
 #include "geometry/domain.h"
 #include "tessellation/corner_shares.h"
 #include "tessellation/own_planes.h"

@@ -4,7 +4,7 @@
 scalar   One work-item for each cell. It works everywhere, and makes the cells that the others leave.
 lanes    Eight cells at a time in the lanes of a CPU's vectors (`cl_kernels/simd/`): in float64, without weights.
          New cells from a number of them on; before, the build of the kernels takes longer than it saves.
-teams    In 3D a team of work-items for each cell: on NVIDIA's GPUs, without weights.
+teams    In 3D a team of work-items for each new cell: on NVIDIA's GPUs, in boxes with walls, without weights.
 =======  ==========================================================================================================
 
 In 2D all give the same bits. In 3D teams have those of scalar. Lanes have the same graph, but sum over the vertices of
@@ -51,13 +51,8 @@ def has_warps(device: cl.Device) -> bool:
 
 
 def has_teams(engine: Engine) -> bool:
-    """Return whether teams update cells in 3D: without weights, on devices where they are faster."""
-    return not engine.traits.site_values and teams_are_faster(engine.queue.device)
-
-
-def has_teams_for_new_cells(engine: Engine) -> bool:
-    """Return whether teams also build cells from scratch: then the box must have walls on all sides."""
-    return engine.traits == PLAIN and FACE_CAPACITY == TEAM and has_teams(engine)
+    """Return whether teams build cells in 3D: in boxes with walls on all sides, on devices where they are faster."""
+    return engine.traits == PLAIN and FACE_CAPACITY == TEAM and teams_are_faster(engine.queue.device)
 
 
 def team_defines(warps: bool) -> dict[str, object]:

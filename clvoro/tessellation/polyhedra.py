@@ -15,7 +15,7 @@ from ..geometry.domain import ClipBox
 from ..opencl.device_array import buffer_of
 from ..opencl.engine import Engine
 from ..opencl.kernels import Kernels
-from .back_ends import LANES_FROM, TEAM, TeamKernel, has_lanes, has_teams_for_new_cells, has_warps, team_defines
+from .back_ends import LANES_FROM, TEAM, TeamKernel, has_lanes, has_teams, has_warps, team_defines
 from .bins import MAX_LEVELS, BinnedPoints
 from .builder import CellBuilder
 from .cut_cells import (
@@ -68,7 +68,7 @@ class Polyhedra(CellBuilder):
         self._programs: dict[int, SimpleNamespace] = {}
         self._kernels(FACE_CAPACITY)
         self._team: TeamKernel | None = None
-        if has_teams_for_new_cells(engine):
+        if has_teams(engine):
             by_teams = engine.kernels(
                 "tessellation/polyhedra_by_teams", team_defines(has_warps(engine.queue.device)), group_size=TEAM
             )

@@ -5,14 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-import pyopencl as cl
 import pyopencl.array as cla
 
 from ..geometry.domain import ClipBox
 from ..opencl.engine import Engine
 from ..opencl.kernels import Kernels
 from ..opencl.workspace import framed
-from .back_ends import TEAM, TeamKernel, has_teams, has_warps, team_defines
 from .cut_cells import CutCells
 from .device_diagram import ROUGH_SHARE, Follow, Tessellation, read_report
 from .polyhedra import Polyhedra
@@ -41,12 +39,6 @@ class PolyhedraUpdate:
     def __init__(self, engine: Engine) -> None:
         self.engine = engine
         self._kernels = engine.kernels("tessellation/polyhedra_update")
-        self._team: TeamKernel | None = None
-        if has_teams(engine):
-            by_teams = engine.kernels(
-                "tessellation/polyhedra_update_by_teams", team_defines(has_warps(engine.queue.device)), group_size=TEAM
-            )
-            self._team = TeamKernel(engine.queue.device, by_teams, "update_cells_by_teams")
         self._report = engine.empty(SIZE, np.int32)
         self._share = engine.real.type(ROUGH_SHARE)
         self._n, self._expected, self._clips = 0, [0], 0
@@ -76,8 +68,7 @@ class PolyhedraUpdate:
         most = int(MAX_SHARE * n)
         if n != self._n:
             self._n, self._expected, self._clips = n, [most], 0
-        by_team = None if self._team is None else self._team.get()
-        rounds = _Rounds(self.engine, self._kernels, by_team, self._report, cells, box, points, previous)
+        rounds = _Rounds(self.engine, self._kernels, self._report, cells, box, points, previous)
         rounds.update(n, ALL_CELLS)
         done, sizes = 0, self._expected
         rounds_before, clips, final = 0, 0, not self._clips
@@ -138,7 +129,6 @@ class _Rounds:
         self,
         engine: Engine,
         kernels: Kernels,
-        by_team: cl.Kernel | None,
         report: cla.Array,
         cells: Polyhedra,
         box: ClipBox,
@@ -146,7 +136,6 @@ class _Rounds:
         previous: Tessellation,
     ) -> None:
         self._engine, self._kernels, self._report = engine, kernels, report
-        self._by_team = by_team
         self._n, before = previous.n, len(previous.neighbors)
         n, most = previous.n, max(int(MAX_SHARE * previous.n), 1)
         # Cells at walls of a solid, and beside ghosts, are clipped anew, to other places.
@@ -179,10 +168,7 @@ class _Rounds:
             self._marks,
             *engine.period_args,
         )
-        if self._by_team is not None:
-            engine.run(self._by_team, TEAM * size, np.int32(size), *args, group=TEAM)
-        else:
-            engine.run_each(self._kernels.update_cells, size, *args)
+        engine.run_each(self._kernels.update_cells, size, *args)
         self.check()
 
     def check(self) -> None:

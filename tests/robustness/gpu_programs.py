@@ -104,7 +104,7 @@ def on_sphere(adapter: clvoro.Adapter) -> None:
 def programs_of_all_kinds(ctx: cl.Context, dtype: str, group: int | None = 128) -> list[Source]:
     """Return every program that small work of all kinds builds: for GPUs in groups of `group`, for a CPU with None.
 
-    Those of teams are among those for GPUs, without warp instructions, which only NVIDIA's compiler has.
+    That of teams is among those for GPUs, without warp instructions, which only NVIDIA's compiler has.
     """
     with contextlib.ExitStack() as stack:
         if group is not None:
@@ -115,20 +115,12 @@ def programs_of_all_kinds(ctx: cl.Context, dtype: str, group: int | None = 128) 
             if not name.startswith("broken"):
                 work(adapter)
         on_sphere(adapter)
-    return sources if group is None else [*sources, *team_programs(ctx, dtype, warps=False)]
+    return sources if group is None else [*sources, team_program(ctx, dtype, warps=False)]
 
 
-TEAM_STAGES = "tessellation/polyhedra_by_teams", "tessellation/polyhedra_update_by_teams"
-
-
-def team_programs(ctx: cl.Context, dtype: str, warps: bool) -> list[Source]:
-    """Return the programs that build and update cells in 3D by teams, with or without warp instructions."""
-    return [team_program(ctx, stage, dtype, warps) for stage in TEAM_STAGES]
-
-
-def team_program(ctx: cl.Context, stage: str, dtype: str, warps: bool) -> Source:
-    """Return one of `TEAM_STAGES`."""
-    engine = Engine(ctx, cl.CommandQueue(ctx), 3, np.dtype(dtype))
+def team_program(ctx: cl.Context, dtype: str, warps: bool) -> Source:
+    """Return the program that builds cells in 3D by teams, with or without warp instructions."""
+    stage, engine = "tessellation/polyhedra_by_teams", Engine(ctx, cl.CommandQueue(ctx), 3, np.dtype(dtype))
     defines = engine.all_defines(stage, team_defines(warps)) | {"GROUP_SIZE": TEAM}
     text, options = _program.program_text(f"{stage}.cl", defines, "")
     return Source(f"{stage}.cl", options, text)
