@@ -37,7 +37,6 @@ from ..version import __version__
 from .cases import Case
 from .outputs import MESH_FILES, PLANE, check_folder, do_all, refuse_own_files, require_plots
 from .progress import ProgressDisplay, during
-from .sequence import frames_line, run_frames
 
 _REPEATED = ("effort", "levels", "error_target", "start", "n_cells", "max_steps", "tol", "alpha", "k", "seed", "dtype")
 """Settings that `case.toml` of the output fixes, so that other defaults of later versions do not change the run."""
@@ -157,19 +156,11 @@ class Job:
                     self._write(adapter, size, results, where)
                 raise
             self.peers.agree(lambda: self._write(adapter, size, results, where))
-            frames = []
-            if self.case.frames > 1 and not self.interrupted:
-                *_, last = results.values()
-                frames = run_frames(
-                    self.case, adapter, last, self.out, lambda: self.interrupted, self.report, self._now_and_then()
-                )
         self.missed = any(result.stop_reason.startswith(MISSES) for result in results.values())
         self._summarize(results, where, profiles)
         self._tell_how_to_continue()
         if self.solver is not None and self.peers.number == 0:
             self._check_for_solver(results)
-        if frames and not self.quiet and not self.as_json:
-            print(frames_line(frames))
         return self.interrupted
 
     def _prepare(self) -> tuple[Any, dict[str, Any]]:
@@ -216,12 +207,11 @@ class Job:
                     "--pieces out"
                 )
             return
-        for number, what in ((self.case.frames, "frames"), (len(self._devices), "devices")):
-            if number > 1:
-                raise InputError(
-                    f"{self.case.name}: the run has {number} {what}, expected one, since ranks share it; run it "
-                    "without mpiexec"
-                )
+        if len(self._devices) > 1:
+            raise InputError(
+                f"{self.case.name}: the run has {len(self._devices)} devices, expected one, since ranks share it; run "
+                "it without mpiexec"
+            )
         self.report = self.report and not self.pieces
         others = [kind for kind in self.mesh_formats if kind != "openfoam"]
         if self.pieces and (others or self.solver is not None or self._land is not None):

@@ -294,16 +294,6 @@ def test_start_from_longitudes_and_latitudes(here):
     assert load(here / "out/small/mesh.npz").points == pytest.approx(X, rel=1e-9, abs=1e-6)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("sizes", ["250 + lat * {t}", "300 + 0 * {t}"], ids=["moving", "constant"])
-def test_frames(here, sizes):
-    text = SMALL.replace("kind = 'constant'\nvalue = 300", f"kind = 'expression'\nexpression = '{sizes}'")
-    (here / "small.toml").write_text(text + "[sequence]\nframes = 2\n")
-    assert call("run", "small.toml", "--quiet") == cli.OK
-    assert len(list((here / "out/small/frames").iterdir())) == 2
-    assert (here / "out/small/pictures/frames.png").is_file()
-
-
 LAND = '{"type": "Polygon", "coordinates": [[[-60, -40], [20, -40], [20, 50], [-60, 50], [-60, -40]]]}'
 
 

@@ -400,7 +400,7 @@ def pressing_run(number):
         (["run", "small.toml", "--method", "magic"], cli.BAD_INPUT, "magic"),
         (["run", "small.toml", "--out", "small.toml"], cli.BAD_INPUT, "folder cannot be created"),
         (["run", "small.toml", "--device", "abacus"], cli.NO_DEVICE, "abacus"),
-        (["cases", "papre"], cli.BAD_INPUT, "airfoil, channel, lake, ocean, paper, sphere, spots, surface"),
+        (["cases", "papre"], cli.BAD_INPUT, "airfoil, channel, lake, ocean, paper, sphere, surface"),
     ],
 )
 def test_errors_are_one_message(here, capsys, arguments, code, named):
@@ -462,7 +462,6 @@ def test_cases_are_listed_and_printed(here, capsys):
         "ocean",
         "paper",
         "sphere",
-        "spots",
         "surface",
     ]
     assert call("cases", "paper") == cli.OK

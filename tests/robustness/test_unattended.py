@@ -269,16 +269,6 @@ def test_results_replace_neither_checkpoints_nor_what_a_run_begins_with(here, ca
     assert np.array_equal(meshes[0], meshes[2])
 
 
-def test_frames_before_one_that_fails_are_kept(here, capsys):
-    text = CASE.replace("size = 0.15\n", "") + '[size]\nkind = "expression"\n'
-    (here / "small.toml").write_text(text + 'expression = "0.2 - 0.3*{t}"\n[sequence]\nframes = 4\n')
-    assert call("--quiet") == cli.BAD_INPUT
-    assert "the size field" in capsys.readouterr().err
-    rows = (here / "out/small/frames.csv").read_text().splitlines()
-    assert len(rows) == 1 + 3  # t = 0, 1/4, 1/2; at 3/4 the size is negative
-    assert len(list((here / "out/small/frames").iterdir())) == 3
-
-
 # Names.
 
 

@@ -94,11 +94,6 @@ class Case:
         return replace(self, table={**self.table, "patches": {**self.patches, **types}}) if types else self
 
     @property
-    def frames(self) -> int:
-        """Number of meshes that follow a moving size field, the first included; see `clvoro.cli.sequence`."""
-        return self.table.get("sequence", {}).get("frames", 1)
-
-    @property
     def methods(self) -> tuple[str | None, ...]:
         """Methods to run in turn, all from the same start; the last one is the main one."""
         return tuple(self.run.get("methods", [self.run.get("method")]))
@@ -118,9 +113,9 @@ class Case:
         checked = schema.check_run({**run, **changes}, f"{self.name}: run")
         return replace(self, table={**self.table, "run": msgspec.to_builtins(checked)})
 
-    def size_field(self, time: float = 0.0) -> Any:
-        """Build the size field (an object of `clvoro.sizing`), with `time` for {t} in expressions."""
-        size = msgspec.convert(_at(self.table["size"], time), schema.Size)
+    def size_field(self) -> Any:
+        """Build the size field (an object of `clvoro.sizing`)."""
+        size = msgspec.convert(self.table["size"], schema.Size)
         return schema.build_size(size, self.folder, self.domain)
 
     def run_arguments(self) -> dict[str, Any]:
@@ -206,16 +201,6 @@ def _tables(node: Any, place: str) -> Iterator[tuple[str, dict[str, Any]]]:
         if isinstance(item, (dict, list)):
             inner = f"{place}[{key}]" if isinstance(key, int) else f"{place}{' ' if place.endswith(':') else '.'}{key}"
             yield from _tables(item, inner)
-
-
-def _at(node: Any, time: float) -> Any:
-    """Return a tree of tables with `time` in the place of {t} in its expressions."""
-    if isinstance(node, Mapping):
-        return {
-            key: value.replace("{t}", f"({time!r})") if key == "expression" else _at(value, time)
-            for key, value in node.items()
-        }
-    return [_at(item, time) for item in node] if isinstance(node, list) else node
 
 
 def builtin_cases() -> Mapping[str, str]:

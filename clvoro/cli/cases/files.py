@@ -17,7 +17,7 @@ except ModuleNotFoundError:  # Python 3.10
 FOLDER = Path(__file__).parent
 """Folder of the built-in cases and their files."""
 WRITTEN = re.compile(
-    r"(mesh|history)(-.*)?\.(vtu|npz|csv|foam|nc|vtk|ply|obj)|graph\.info(\.part\.\d+)?|case\.toml|report\.html|frames\.csv|frames|pictures|constant"
+    r"(mesh|history)(-.*)?\.(vtu|npz|csv|foam|nc|vtk|ply|obj)|graph\.info(\.part\.\d+)?|case\.toml|report\.html|pictures|constant"
 )
 """Names of the files that a run writes into its folder."""
 LONGEST = 1 << 21

@@ -714,10 +714,6 @@ class LayersTable(Table):
     edges: Walls | None = None
 
 
-class Sequence(Table):
-    frames: Count | None = None
-
-
 class CaseTable(Table, kw_only=True):
     name: str | None = None
     title: Text | None = None
@@ -725,7 +721,6 @@ class CaseTable(Table, kw_only=True):
     size: Size
     run: RunSettings | None = None
     layers: Annotated[list[LayersTable], Meta(min_length=1)] | None = None
-    sequence: Sequence | None = None
     patches: dict[str, PatchType] | None = None
 
 
@@ -740,7 +735,6 @@ HOMES = {
     "[size]": _keys(*get_args(Size)[1:]),
     "[run]": _keys(RunSettings),
     "[[layers]]": _keys(LayersTable),
-    "[sequence]": _keys(Sequence),
 }
 """The keys of each table."""
 
