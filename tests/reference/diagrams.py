@@ -19,6 +19,11 @@ class Cell:
     centroid: np.ndarray
 
 
+def faults(diagram) -> list[str]:
+    """Return the faults of a diagram that are found without a reference."""
+    return list(map(str, diagram.check().findings))
+
+
 def measures(polygon: np.ndarray) -> tuple[float, np.ndarray]:
     """Return area and centroid of a polygon (k, 2)."""
     origin = polygon.mean(axis=0)

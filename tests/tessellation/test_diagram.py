@@ -77,48 +77,9 @@ def points(request):
     return POINTS[request.param]
 
 
-def check_invariants(diagram, eps):
-    """Check that cells tile the box and are closed, that the graph is symmetric, and Euler's formula."""
-    n = len(diagram.points)
-    box, starts = diagram.domain, diagram.neighbor_starts
-    # The round-off of each cell is at most eps of the box; the errors add up like a random walk.
-    assert diagram.volumes.sum() == pytest.approx(box.measure, rel=8 * eps)
-    assert (diagram.volumes > 0).all()
-    i = np.repeat(np.arange(n), np.diff(starts))
-    j = diagram.neighbors
-    inner = j >= 0
-    pairs = set(zip(i[inner].tolist(), j[inner].tolist(), strict=True))
-    assert len(pairs) == inner.sum(), "a neighbor is listed twice"
-    assert all((b, a) in pairs for a, b in pairs), "the graph is not symmetric"
-    # The outward normals of a closed polygon, weighted by length, sum to zero.
-    corners = diagram.vertices[diagram.cell_vertices]
-    scale = box.extent.max()
-    assert (diagram.cell_vertex_starts == starts).all()
-    following = np.arange(len(j)) + 1
-    following[starts[1:] - 1] = starts[:-1]
-    edge = corners[following] - corners
-    assert np.abs(np.hypot(*edge.T) - diagram.face_measures).max() <= 64 * eps * scale
-    assert np.abs((corners[following] + corners) / 2 - diagram.face_centroids).max() <= 64 * eps * scale
-    a = corners - diagram.points[i]
-    b = corners[following] - diagram.points[i]
-    turn = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
-    assert turn.min() >= -64 * eps * scale**2, "corners are not counter-clockwise"
-    # Euler: V - E + F = 1 for a tiled disc.
-    edges = inner.sum() // 2 + (~inner).sum()
-    assert len(diagram.vertices) - edges + n == 1
-    assert len(np.unique(diagram.cell_vertices)) == len(diagram.vertices)
-    # Wall faces lie on their wall and fill it.
-    for axis in range(2):
-        for side, wall in enumerate((box.lower[axis], box.upper[axis])):
-            on = j == -1 - (2 * axis + side)
-            assert np.abs(diagram.face_centroids[on, axis] - wall).max() <= 4 * eps * scale
-            assert diagram.face_measures[on].sum() == pytest.approx(box.extent[1 - axis], rel=64 * eps)
-
-
 @pytest.mark.sparse(10)
 def test_invariants(adapter, points):
-    diagram = adapter.diagram(BOX, points)
-    check_invariants(diagram, float(np.finfo(adapter.dtype).eps))
+    assert not reference.faults(adapter.diagram(BOX, points))
 
 
 @pytest.mark.sparse(6)
@@ -191,7 +152,7 @@ def test_near_duplicates(adapter64, gap):
         assert gap < 1e-12
         assert "too close" in refused
     else:
-        check_invariants(diagram, np.finfo(float).eps)
+        assert not reference.faults(diagram)
         for i, cell in enumerate(reference.exact_cells(BOX.lower, BOX.upper, points[:60])[:3]):
             assert few.volumes[i] == pytest.approx(cell.area, abs=1e-12 * BOX.measure / gap * 1e-3)
 
@@ -209,7 +170,7 @@ def test_many_cocircular_neighbors_enlarge_the_capacity(adapter64):
     points = np.concatenate([ring, [[1.25, 0.75]]])
     diagram = adapter64.diagram(BOX, points)
     assert np.diff(diagram.neighbor_starts)[-1] == 150
-    check_invariants(diagram, np.finfo(float).eps)
+    assert not reference.faults(diagram)
 
 
 @pytest.mark.parametrize("name", ["random", "graded"])
@@ -263,7 +224,7 @@ def test_degenerate_sets(adapter64, places):
     points = a[:, :2] / [12, 8] * BOX.extent
     points = np.where(a[:, 2:] == 0, points, np.nextafter(points, points + a[:, 2:]))
     points = np.clip(points, BOX.lower, BOX.upper)
-    check_invariants(adapter64.diagram(BOX, points), np.finfo(float).eps)
+    assert not reference.faults(adapter64.diagram(BOX, points))
 
 
 @pytest.mark.parametrize("seed", [1, 4])

@@ -12,6 +12,7 @@ from clvoro.errors import InputError
 from clvoro.opencl.engine import Engine
 from clvoro.tessellation.back_ends import LANES_FROM
 from clvoro.tessellation.tessellator import Tessellator
+from tests.reference.diagrams import faults
 from tests.reference.spheres import UNIT, SphericalDiagram, clustered_points, grid_of_rings, random_points
 
 SETS = {
@@ -101,16 +102,7 @@ def test_measures(ctx, name, real):
 @pytest.mark.parametrize("real", PRECISIONS)
 @pytest.mark.parametrize("points", [*SETS.values(), grid_of_rings()], ids=[*SETS, "rings"])
 def test_cells_fill_the_sphere(ctx, points, real):
-    d = clvoro.Adapter(ctx, real).diagram(clvoro.Sphere(3.0), points)
-    eps, n = float(np.finfo(real).eps), len(d)
-    assert d.volumes.sum() == pytest.approx(d.domain.measure, rel=64 * eps)
-    assert d.volumes.min() > 0
-    owner = np.repeat(np.arange(n), np.diff(d.neighbor_starts))
-    here, there = owner * n + d.neighbors, d.neighbors.astype(np.int64) * n + owner
-    assert np.array_equal(np.sort(here), np.sort(there))
-    assert len(d.vertices) - len(owner) // 2 + n == 2  # Euler
-    radius = np.linalg.norm(d.vertices, axis=1)
-    assert radius == pytest.approx(np.full(len(radius), 3.0), rel=4 * eps)
+    assert not faults(clvoro.Adapter(ctx, real).diagram(clvoro.Sphere(3.0), points))
 
 
 def test_four_cells_at_a_vertex(ctx):

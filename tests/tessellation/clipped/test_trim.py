@@ -10,7 +10,8 @@ from clvoro.errors import InputError
 from clvoro.opencl.engine import Engine
 from clvoro.tessellation.readback.diagram import fetch_diagram
 from clvoro.tessellation.tessellator import Tessellator
-from tests.reference.polygon_diagrams import euler_excess, faults, polygon_voronoi
+from tests.reference.diagrams import faults
+from tests.reference.polygon_diagrams import euler_excess, polygon_voronoi
 from tests.reference.shores import DIAMOND, POLYGONS, TOUCHING, UNIT, coast, comb, koch, lattice, scattered, slit, spit
 
 REALS = ("float64", "float32")
@@ -29,7 +30,7 @@ def compare(adapters, domain, points, length=1024, euler=False):
     size = float(domain.extent.max())
     for real, adapter in adapters.items():
         diagram = adapter.diagram(domain, points)
-        assert faults(diagram, real) == []
+        assert not faults(diagram)
         # Coordinates of domains far from the origin are rounded before they reach the device.
         far = max(map(abs, (*domain.lower, *domain.upper))) / size
         eps = float(np.finfo(real).eps) + far * float(np.finfo(float).eps)
@@ -147,8 +148,8 @@ def test_rings_that_touch(adapters, name):
     sets = [scattered(domain, 60, 1), domain.oriented.vertices, *(lattice(k) for k in (2, 4, 6, 8, 10))]
     for points in sets:
         inside = np.unique(points[domain.contains(points)], axis=0)
-        for real, adapter in adapters.items():
-            assert faults(adapter.diagram(domain, inside), real) == []
+        for adapter in adapters.values():
+            assert not faults(adapter.diagram(domain, inside))
 
 
 @pytest.mark.slow
@@ -169,7 +170,7 @@ def test_round_off_decides_nothing(adapters):
         points = points + eps * rng.standard_normal(points.shape) * (k % 3 > 0)
         points = points[moved.contains(points)]
         if len(points):
-            assert faults(adapters[real].diagram(moved, points), real) == [], (k, name)
+            assert not faults(adapters[real].diagram(moved, points)), (k, name)
 
 
 def test_islands_in_a_lake_in_a_cell(adapters):
@@ -206,7 +207,7 @@ def test_holes_that_touch_the_boundary_of_their_piece(adapters):
                 compare(adapters, domain, points)
             for real, adapter in adapters.items():
                 diagram = adapter.diagram(domain, points)
-                assert faults(diagram, real) == []
+                assert not faults(diagram)
                 # Coordinates up to 4 are rounded.
                 assert diagram.volumes[0] == pytest.approx(0.16, abs=4 * float(np.finfo(real).eps))
 
@@ -238,7 +239,7 @@ def test_parts_thinner_than_round_off_are_rejected_or_correct(adapters):
                 assert "float64" in str(error)  # noqa: PT017
                 refused += 1
                 continue
-            assert faults(diagram, "float32") == []
+            assert not faults(diagram)
     assert refused < 30
 
 
@@ -256,8 +257,8 @@ def test_parts_thinner_than_round_off_are_rejected_or_correct(adapters):
 def test_many_edges(adapters, make, n):
     domain = clvoro.Polygon(make())
     points = scattered(domain, n, 3)
-    for real, adapter in adapters.items():
-        assert faults(adapter.diagram(domain, points), real) == []
+    for adapter in adapters.values():
+        assert not faults(adapter.diagram(domain, points))
 
 
 @pytest.mark.parametrize("real", REALS)
