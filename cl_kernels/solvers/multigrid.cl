@@ -1,7 +1,7 @@
 /* One V-cycle of multigrid on graphs of aggregated cells (see solvers/aggregation.cl).
 
-   Vectors are in REAL, the multigrid's own precision. SOURCE is the caller's: the residual is read and the correction
-   written in it.
+   Vectors are in REAL, the multigrid's own precision. SOURCE is the caller's: `take_residual` and `give_correction` are
+   first and last.
 
    The smoother is Chebyshev's polynomial of degree 2 in B^-1 A on [0.35, 2], applied as two damped pairwise-Jacobi
    steps. There are kernels for each step, kernels for several steps at once, and `cycle_by_group`, which does all
@@ -17,16 +17,20 @@ inline REAL apply_pair_inverse(int i, global const int *partner, global const RE
     return own[i] * r[i] + both[i] * (r[i] + r[partner[i]]);
 }
 
-/* b = r rounded to REAL, x = omega B^-1 b: the first step from x = 0 on the finest level. */
-kernel void smooth_from_zero_rounded(int n, REAL omega, global const int *partner, global const REAL *own,
-                                     global const REAL *both, global const SOURCE *r, global REAL *b, global REAL *x)
+/* b = r, rounded. */
+kernel void take_residual(int n, global const SOURCE *r, global REAL *b)
 {
     const int i = get_global_id(0);
-    if (i >= n)
-        return;
-    const REAL bi = (REAL)r[i];
-    b[i] = bi;
-    x[i] = omega * (own[i] * bi + both[i] * (bi + (REAL)r[partner[i]]));
+    if (i < n)
+        b[i] = r[i];
+}
+
+/* u = x. */
+kernel void give_correction(int n, global const REAL *x, global SOURCE *u)
+{
+    const int i = get_global_id(0);
+    if (i < n)
+        u[i] = x[i];
 }
 
 /* x = omega B^-1 b: the first step from x = 0. */
@@ -54,15 +58,6 @@ kernel void smooth(int n, REAL omega, global const int *partner, global const RE
     const int i = get_global_id(0);
     if (i < n)
         x[i] += omega * apply_pair_inverse(i, partner, own, both, t);
-}
-
-/* u = x + omega B^-1 t, in the caller's precision: the last step of the cycle. */
-kernel void smooth_into(int n, REAL omega, global const int *partner, global const REAL *own, global const REAL *both,
-                        global const REAL *t, global const REAL *x, global SOURCE *u)
-{
-    const int i = get_global_id(0);
-    if (i < n)
-        u[i] = x[i] + omega * apply_pair_inverse(i, partner, own, both, t);
 }
 
 /* Sum of t over the members of aggregate g. */
@@ -112,12 +107,6 @@ inline REAL pair_inverse(REAL own, REAL both, REAL ti, REAL tj)
 ROW_DIFFERENCE(first_step_difference, FIRST_STEP, REAL omega, global const int *partner, global const REAL *own,
                global const REAL *both, global const REAL *b)
 
-/* The same of r, in the caller's precision, rounded to REAL. */
-#define ROUNDED(j) ((REAL)r[j])
-#define FIRST_ROUNDED_STEP(j) (omega * pair_inverse(own[j], both[j], ROUNDED(j), ROUNDED(partner[j])))
-ROW_DIFFERENCE(first_rounded_step_difference, FIRST_ROUNDED_STEP, REAL omega, global const int *partner,
-               global const REAL *own, global const REAL *both, global const SOURCE *r)
-
 /* Two steps from x = 0. */
 kernel void smooth_pairs_from_zero(int n, REAL omega, REAL next, global const int *starts, global const int *columns,
                                    global const REAL *weights, global const int *partner, global const REAL *own,
@@ -130,25 +119,6 @@ kernel void smooth_pairs_from_zero(int n, REAL omega, REAL next, global const in
     x[i] = FIRST_STEP(i) + next * pair_inverse(own[i], both[i], ti, tj);
     if (i != j)
         x[j] = FIRST_STEP(j) + next * pair_inverse(own[j], both[j], tj, ti);
-}
-
-/* The same on the finest level: b = r rounded to REAL. */
-kernel void smooth_pairs_from_zero_rounded(int n, REAL omega, REAL next, global const int *starts,
-                                           global const int *columns, global const REAL *weights,
-                                           global const int *partner, global const REAL *own, global const REAL *both,
-                                           global const SOURCE *r, global REAL *b, global REAL *x)
-{
-    PAIR(i, j);
-    const REAL bi = ROUNDED(i), bj = ROUNDED(j);
-    const REAL ti = bi - first_rounded_step_difference(i, n, starts, columns, weights, omega, partner, own, both, r);
-    const REAL tj =
-        i == j ? ti : bj - first_rounded_step_difference(j, n, starts, columns, weights, omega, partner, own, both, r);
-    b[i] = bi;
-    x[i] = FIRST_ROUNDED_STEP(i) + next * pair_inverse(own[i], both[i], ti, tj);
-    if (i != j) {
-        b[j] = bj;
-        x[j] = FIRST_ROUNDED_STEP(j) + next * pair_inverse(own[j], both[j], tj, ti);
-    }
 }
 
 /* to = x + omega B^-1 (b - A x), for the pair of the work-item. */
@@ -166,14 +136,6 @@ kernel void smooth_pairs(int n, REAL omega, global const int *starts, global con
                          global const REAL *both, global const REAL *b, global const REAL *x, global REAL *to)
 {
     SMOOTH_PAIR(ENTRY_OF_X, row_difference, to, x);
-}
-
-/* The same to the caller's array: the last step of the cycle. */
-kernel void smooth_pairs_into(int n, REAL omega, global const int *starts, global const int *columns,
-                              global const REAL *weights, global const int *partner, global const REAL *own,
-                              global const REAL *both, global const REAL *b, global const REAL *x, global SOURCE *u)
-{
-    SMOOTH_PAIR(ENTRY_OF_X, row_difference, u, x);
 }
 
 /* x + the correction of the aggregate. */

@@ -23,7 +23,6 @@ _LOWEST = 0.35
 _CENTER, _RADIUS = (2 + _LOWEST) / 2, (2 - _LOWEST) / 2
 _EARLY = np.float32(1 / (_CENTER - _RADIUS * math.sqrt(0.5)))
 _LATE = np.float32(1 / (_CENTER + _RADIUS * math.sqrt(0.5)))
-_NO_DAMPING = np.float32(0)
 _COARSE, _COARSE_FACTOR = "cycle_by_group", 4
 """Kernel of one work-group, which does several steps in a launch; ratio of its work-items to those of other groups, and
 of the largest levels that it does."""
@@ -102,17 +101,21 @@ class Cycle:
         if self._rest is not None and levels[-1].aggregates is not None:
             count = len(levels[-1].aggregates)
             self._vectors.append([self._room("rest", name, size=count) for name in "bx"])
+        if not in_place:
+            self._add(0, "take_residual", len(levels[0]), r, finest[0])
         # Levels that are smoothed by launches of their own.
         count = self._first_coarse()
         for depth in range(count):
-            self._descend(depth, None if depth or in_place else r)
+            self._descend(depth)
         if self._rest is not None:
             rest, (b, x, *_) = self._rest, self._vectors[-1]
             self._launches.append(partial(rest, b, x))
         elif count < len(levels):
-            self._solve_coarse(count, *(None, None) if count or in_place else (r, u))
+            self._solve_coarse(count)
         for depth in reversed(range(count)):
-            self._ascend(depth, None if depth or in_place else u)
+            self._ascend(depth)
+        if not in_place:
+            self._add(0, "give_correction", len(levels[0]), finest[1], u)
 
     def _first_coarse(self) -> int:
         """Return the number of levels before those that one work-group does."""
@@ -144,17 +147,14 @@ class Cycle:
             whole, group = round_to_work_group(size), fit_group(kernel, WORK_GROUP)
         self._launches.append(partial(self.engine.enqueue, kernel, whole, group))
 
-    def _descend(self, depth: int, r: cla.Array | None) -> None:
-        """Smooth from zero and restrict the defect. The right side is rounded from `r`, if given."""
+    def _descend(self, depth: int) -> None:
+        """Smooth from zero and restrict the defect."""
         level, (b, x, t), n = self._levels[depth], self._vectors[depth], len(self._levels[depth])
         rows, blocks = level.graph.rows, level.pairs.blocks
-        right = (b,) if r is None else (r, b)
         if self.merged:
-            name = "smooth_pairs_from_zero" if r is None else "smooth_pairs_from_zero_rounded"
-            self._add(depth, name, n, _LATE, _EARLY, *rows, *blocks, *right, x)
+            self._add(depth, "smooth_pairs_from_zero", n, _LATE, _EARLY, *rows, *blocks, b, x)
         else:
-            name = "smooth_from_zero" if r is None else "smooth_from_zero_rounded"
-            self._add(depth, name, n, _LATE, *blocks, *right, x)
+            self._add(depth, "smooth_from_zero", n, _LATE, *blocks, b, x)
             self._smooth(depth, _EARLY)
         if level.aggregates is None:
             return
@@ -173,15 +173,10 @@ class Cycle:
             self._launches.append(partial(graph.ghosts.fill, self.engine, len(graph), x))
         self._add(depth, "compute_defect", len(graph), *graph.rows, b, x, t)
 
-    def _solve_coarse(self, depth: int, r: cla.Array | None, u: cla.Array | None) -> None:
-        """Do the cycle from `depth` on by one work-group, from `r` and into `u`, if given."""
-        levels, (b, x, _), n = self._levels[depth:], self._vectors[depth], len(self._levels[depth])
-        blocks = self._levels[depth].pairs.blocks
-        if r is not None:
-            self._add(depth, "smooth_from_zero_rounded", n, _NO_DAMPING, *blocks, r, b, x)
+    def _solve_coarse(self, depth: int) -> None:
+        """Do the cycle from `depth` on by one work-group."""
+        levels, (b, x, _) = self._levels[depth:], self._vectors[depth]
         self._add(depth, _COARSE, len(levels), _LATE, _EARLY, *self._pack(levels), self._factor, b, x)
-        if u is not None:
-            self._add(depth, "smooth_into", n, _NO_DAMPING, *blocks, b, x, u)
 
     def _pack(self, levels: Sequence[Level]) -> tuple[cla.Array, ...]:
         """Return the table of `levels`, their integers and their reals; see multigrid.cl."""
@@ -221,8 +216,8 @@ class Cycle:
         self._packed = list(levels), (table, *to.values())
         return self._packed[1]
 
-    def _ascend(self, depth: int, u: cla.Array | None) -> None:
-        """Add the correction of the coarser level and smooth. The last step writes to `u`, if given."""
+    def _ascend(self, depth: int) -> None:
+        """Add the correction of the coarser level and smooth."""
         level, (b, x, t), n = self._levels[depth], self._vectors[depth], len(self._levels[depth])
         correction: tuple[cla.Array, ...] = ()
         if level.aggregates is not None:
@@ -231,22 +226,16 @@ class Cycle:
             if correction:
                 self._add(depth, "prolong", n, *correction, x)
             self._smooth(depth, _EARLY)
-            self._smooth(depth, _LATE, u)
+            self._smooth(depth, _LATE)
             return
         given = *level.graph.rows, *level.pairs.blocks, b
         name = "prolong_and_smooth_pairs" if correction else "smooth_pairs"
         self._add(depth, name, n, _EARLY, *given, x, *correction, t)
-        if u is None:
-            self._add(depth, "smooth_pairs", n, _LATE, *given, t, x, turn=1)
-        else:
-            self._add(depth, "smooth_pairs_into", n, _LATE, *given, t, u)
+        self._add(depth, "smooth_pairs", n, _LATE, *given, t, x, turn=1)
 
-    def _smooth(self, depth: int, damping: np.float32, u: cla.Array | None = None) -> None:
-        """Do one step of smoothing in place, or into `u`."""
+    def _smooth(self, depth: int, damping: np.float32) -> None:
+        """Do one step of smoothing in place."""
         level, (_, x, t), n = self._levels[depth], self._vectors[depth], len(self._levels[depth])
         self._compute_defect(depth)
-        if u is None:
-            turn = int(damping is _LATE)
-            self._add(depth, "smooth", n, damping, *level.pairs.blocks, t, x, turn=turn)
-        else:
-            self._add(depth, "smooth_into", n, damping, *level.pairs.blocks, t, x, u)
+        turn = int(damping is _LATE)
+        self._add(depth, "smooth", n, damping, *level.pairs.blocks, t, x, turn=turn)
