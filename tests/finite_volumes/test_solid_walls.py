@@ -227,7 +227,7 @@ def test_a_cell_with_a_concave_crease_is_cut(ctx):
     assert len(d) > len(x)
 
 
-def test_a_crease_that_cannot_be_followed_is_left_out(ctx):
+def test_a_crease_that_cannot_be_followed_is_left_out(ctx, monkeypatch):
     """Where one generator beside the crease is missing, faces of the others lie in a wall."""
     solid = el()
     x = generators(solid)
@@ -238,6 +238,10 @@ def test_a_crease_that_cannot_be_followed_is_left_out(ctx):
     assert d.check("openfoam")
     assert np.abs(d.left_out.measures).sum() < 0.5 * H**3
     assert d.volumes.sum() == pytest.approx(solid.measure, rel=0.01)
+    monkeypatch.setattr("clvoro.finite_volumes.solid_walls.mesh._MANY", 0)
+    monkeypatch.setattr("clvoro.finite_volumes.solid_walls.mesh._SHARE", 0)
+    with pytest.raises(InputError, match=r"details finer than cells.* wrap=0.1"):
+        solid_diagram(WallSurface(solid), x, h, lambda x: whole_faces(ctx, solid, x, h))
 
 
 def test_generators_around_concave_creases_stay_in_the_middle():

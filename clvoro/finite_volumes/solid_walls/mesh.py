@@ -50,6 +50,8 @@ _CENTERINGS = 3
 """How often generators are moved there."""
 _WORSE = 1000
 """How many cells with such faces are as bad as a cell that OpenFOAM rejects."""
+_MANY, _SHARE = 250, 0.05
+"""So many rejected cells, and such a share of those at walls, are more than cures can mend in a time like the run's."""
 _GOLDEN = (5**0.5 - 1) / 2
 _SIMPLER, _SIMPLER_AFTER = 3, 2
 """How often walls of rejected cells become simpler, at first and after each move of generators."""
@@ -218,11 +220,11 @@ def solid_diagram(
             tell(f"walls of {len(near.rows)} cells")
             raw = _Maker(surface, near, np.append(state[near.rows, 3], EXACT)).mesh()
             _check_lost(surface, near, raw.home)
+            made = _finished(surface, raw, None if last is None else last.cures, tell, centers and last is None)
         except InputError:  # a simpler cell of a thin part may be nothing
             if last is None:
                 raise
             return None
-        made = _finished(surface, raw, None if last is None else last.cures, tell)
         latest[:] = [made]
         return made
 
@@ -326,10 +328,24 @@ def _check_lost(surface: WallSurface, near: NearWalls, home: np.ndarray) -> None
         )
 
 
-def _finished(surface: WallSurface, raw: _Made, earlier: Cures | None, tell: Callable[[str], object]) -> _Made:
+def _check_followed(surface: WallSurface, near: NearWalls, cells: np.ndarray) -> None:
+    """Raise an `InputError` if so many `cells` (k,) are rejected that cures of all would take long, and help few."""
+    if len(cells) > max(_MANY, _SHARE * len(near.rows)):
+        raise InputError(
+            f"{surface.solid} has details finer than cells in many places: {len(cells)} of {len(near.rows)} cells at "
+            f"walls are concave or inverted, the first at {format_point(near.generators[cells[0]])}, where h is "
+            f"{near.sizes[cells[0]]:.3g}; use smaller sizes there, or leave out such details: Solid(..., wrap="
+            f"{near.sizes[cells].min() / 1.5:.2g}), as Solid.read has it, too"
+        )
+
+
+def _finished(
+    surface: WallSurface, raw: _Made, earlier: Cures | None, tell: Callable[[str], object], checks: bool
+) -> _Made:
     """Return `raw` cells near the surface without short edges and slivers, cured where OpenFOAM rejects them.
 
-    `earlier` cures are repeated in cells that both meshes share.
+    `earlier` cures are repeated in cells that both meshes share. With `checks`, an `InputError` is raised if too many
+    cells are rejected.
     """
     near, home, own, cures = raw.near, raw.home, raw.own, None
     tell("short edges at walls")
@@ -343,6 +359,8 @@ def _finished(surface: WallSurface, raw: _Made, earlier: Cures | None, tell: Cal
         rejected = rejected_at_walls(faces, with_neighbors(faces, changed | suspect))
     if len(rejected):
         tell("cells that are rejected at walls")
+        if checks:
+            _check_followed(surface, near, home[rejected])
         names, h = near.numbers[home], near.sizes[home]
         faces, origin, own, rejected, cures = cured(surface, faces, names, own, h, rejected, earlier)
         home = home[origin]
