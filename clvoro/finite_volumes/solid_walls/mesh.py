@@ -335,7 +335,7 @@ def _check_followed(surface: WallSurface, near: NearWalls, cells: np.ndarray) ->
             f"{surface.solid} has details finer than cells in many places: {len(cells)} of {len(near.rows)} cells at "
             f"walls are concave or inverted, the first at {format_point(near.generators[cells[0]])}, where h is "
             f"{near.sizes[cells[0]]:.3g}; use smaller sizes there, or leave out such details: Solid(..., wrap="
-            f"{near.sizes[cells].min() / 1.5:.2g}), as Solid.read has it, too"
+            f"{np.median(near.sizes[cells]) / 1.5:.2g}), as Solid.read has it, too"
         )
 
 
