@@ -16,7 +16,7 @@ from ..mesh.diagram import Diagram
 from ..mesh.faces import Faces
 from ..mesh.geometry import sum_rows
 from .collapse import collapse_short
-from .moves import FEW, MOVES, fewest_rejected, moved
+from .moves import FEW, MOVES, least_bad, moved
 from .solid_walls.mend import NARROW, cells_of, narrow_faces, rejected_among, with_neighbors
 from .solid_walls.mesh import diagram_of
 
@@ -99,7 +99,11 @@ def on_surfaces(
     def change(points: np.ndarray, rows: np.ndarray, move: int) -> np.ndarray:
         return moved(domain, depth, sizes, points, rows, move, held) if len(rows) <= FEW * len(points) else points
 
-    return fewest_rejected(first, points, sizes, lambda a: a.home[a.rejected], change, again, [False] * MOVES).diagram
+    def badness(made: _OnSurfaces) -> np.ndarray:
+        n = len(points) + 1
+        return np.bincount(made.home[made.rejected] % n, minlength=n).astype(float)
+
+    return least_bad(first, points, sizes, badness, change, again, [False] * MOVES).diagram
 
 
 def _made(diagram: Diagram, sheets: Sheets) -> _OnSurfaces:

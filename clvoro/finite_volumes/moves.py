@@ -11,7 +11,6 @@ import scipy
 from ..geometry.domain import Domain
 from ..geometry.solid.creases import connect
 from ..geometry.surfaces.sheets import Sheets
-from ..mesh.connectivity import distinct
 
 T = TypeVar("T")
 FEW = 0.03
@@ -32,19 +31,19 @@ _FREE = 0.9
 """Distance from surfaces inside, over h, below which generators without a partner do not come nearer."""
 
 
-def fewest_rejected(
+def least_bad(
     first: T,
     state: np.ndarray,
     sizes: np.ndarray,
-    rejected: Callable[[T], np.ndarray],
+    badness: Callable[[T], np.ndarray],
     change: Callable[[np.ndarray, np.ndarray, int], np.ndarray],
     remake: Callable[[np.ndarray, T], T | None],
     goes_on: list[bool],
 ) -> T:
-    """Change what a mesh is made of at rejected cells; return the mesh of the fewest rejected cells.
+    """Change what a mesh is made of at bad cells; return the mesh with the least sum of badness.
 
-    Rejected cells near each other are a group. If it has fewer of them after a change, what changed in it stays;
-    all else is changed back.
+    Bad cells near each other are a group. If it is less bad after a change, what changed in it stays; all else is
+    changed back.
 
     Parameters
     ----------
@@ -52,52 +51,53 @@ def fewest_rejected(
         The mesh of `state` (n, k): the generators, (n, 3), and more columns of numbers if it depends on these.
     sizes : (n,) float
         h at the generators.
-    rejected : callable
-        Returns the generators of the rejected cells of a mesh, (k,) int; -1 for none.
+    badness : callable
+        Returns how bad the cells of each generator are in a mesh, (n + 1,) float, 0 for good ones. The last number is
+        that of cells without a generator.
     change : callable
         Called with the state, some rows (k,) int, and the number of the trial. Returns a state with those rows
         changed, and those beside them; or the same one, for which no mesh is made.
     remake : callable
         Called with another state and the last mesh. Returns the mesh of that state, or None if there is none.
     goes_on : list of bool
-        For each trial whether it changes the state of the one before at the cells that were rejected then. Others
-        change the best state so far.
+        For each trial whether it changes the state of the one before at the cells that were bad then. Others change
+        the best state so far.
     """
-    best, last, bad, points = first, first, rejected(first), state[:, :3]
+    best, last, bad, points = first, first, badness(first), state[:, :3]
+    least = bad.sum()
     tried, new = state, bad
     for number, further in enumerate(goes_on):
-        base, rows = (tried, new) if further else (state, bad)
-        rows = distinct(rows[rows >= 0])
-        if not (bad >= 0).any():
+        base, of = (tried, new) if further else (state, bad)
+        if not bad.any():
             break
+        rows = np.flatnonzero(of[:-1])
         trial = change(base, rows, number) if len(rows) else base
         if (trial == base).all() or (made := remake(trial, last)) is None:
             continue
-        last, tried, new = made, trial, rejected(made)
-        if len(new) < len(rejected(best)):
-            best = made
-        bad, new = bad[bad >= 0], new[new >= 0]
-        count, group = _groups(points, sizes, np.concatenate([bad, new]))
-        before, after = np.split(group, [len(bad)])
-        fewer = np.bincount(after, minlength=count) < np.bincount(before, minlength=count)
+        last, tried, new = made, trial, badness(made)
+        if new.sum() < least:
+            best, least = made, new.sum()
+        had, found = np.flatnonzero(bad[:-1]), np.flatnonzero(bad[:-1] + new[:-1])
+        count, group = _groups(points, sizes, found)
+        before, after = (np.bincount(group, values[found], count) for values in (bad, new))
         changed = np.flatnonzero((trial != state).any(axis=1))
-        changed = changed[fewer[before[scipy.spatial.KDTree(points[bad]).query(points[changed])[1]]]]
+        at = had[scipy.spatial.KDTree(points[had]).query(points[changed])[1]]
+        changed = changed[(after < before)[group[np.searchsorted(found, at)]]]
         state = state.copy()
         state[changed] = trial[changed]
-        bad = np.concatenate([bad[~fewer[before]], new[fewer[after] | ~np.isin(after, before)]])
-    if len(bad) < len(rejected(best)) and (made := remake(state, last)) is not None:
-        best = min(best, made, key=lambda mesh: len(rejected(mesh)))
+        replaced = ((after < before) | (before == 0))[group]
+        bad = np.bincount(found, np.where(replaced, new[found], bad[found]), len(bad))
+    if bad.sum() < least and (made := remake(state, last)) is not None:
+        best = min(best, made, key=lambda mesh: badness(mesh).sum())
     return best
 
 
 def _groups(points: np.ndarray, sizes: np.ndarray, rows: np.ndarray) -> tuple[int, np.ndarray]:
-    """Return the number of groups of near generators, and the group of each of `rows` (k,) int, which may repeat."""
-    rows, again = np.unique(rows, return_inverse=True)
+    """Return the number of groups of near generators, and the group of each of `rows` (k,) int."""
     x, h = points[rows], _GROUP * sizes[rows]
     pairs = scipy.spatial.KDTree(x).query_pairs(float(h.max()), output_type="ndarray")
     apart = np.linalg.norm(x[pairs[:, 0]] - x[pairs[:, 1]], axis=1)
-    count, group = connect(len(rows), pairs[apart < h[pairs].min(axis=1)])
-    return count, group[again]
+    return connect(len(rows), pairs[apart < h[pairs].min(axis=1)])
 
 
 def moved(

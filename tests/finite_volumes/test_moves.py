@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import clvoro
-from clvoro.finite_volumes.moves import fewest_rejected, moved
+from clvoro.finite_volumes.moves import least_bad, moved
 
 H = 0.25
 CUBE = clvoro.Solid.box((0, 0, 0), (1, 1, 1))
@@ -48,8 +48,8 @@ def test_pairs_stay_mirror_images_in_all_patches_between_them():
         assert domain.borders.sheets.distance(x[6:] + away[6:])[0] >= 0.9 * H - 1e-12
 
 
-def test_the_mesh_of_the_fewest_rejected_cells_is_kept():
-    """What changed in a group stays if it has fewer rejected cells. Trials go on from there, or from the one before."""
+def test_the_mesh_of_the_least_bad_cells_is_kept():
+    """What changed in a group stays if it is less bad then. Trials go on from there, or from the one before."""
     state = np.column_stack([np.arange(300) * 3.0, np.zeros((300, 3))])
     begun = []
 
@@ -60,10 +60,10 @@ def test_the_mesh_of_the_fewest_rejected_cells_is_kept():
     def kept(first, meshes, goes_on):
         meshes = iter(meshes)
 
-        def rejected(mesh):
-            return np.array(mesh, int)
+        def badness(mesh):
+            return np.bincount(np.array(mesh, int) % 301, minlength=301).astype(float)
 
-        return fewest_rejected(first, state, np.ones(300), rejected, change, lambda now, last: next(meshes), goes_on)
+        return least_bad(first, state, np.ones(300), badness, change, lambda now, last: next(meshes), goes_on)
 
     first, better = [0, 1, 1, 100, 200], [0, 1, 200, -1]
     assert kept(first, [better, [0, 0, 1, 200], None, [0, 1]], [False] * 4) == [0, 1]

@@ -11,12 +11,11 @@ import scipy
 
 from ...arguments import format_point, warn
 from ...errors import InputError, MismatchWarning
-from ...geometry.solid.creases import connect
 from ...mesh.connectivity import distinct, following, take_ranges, take_rows
 from ...mesh.diagram import Diagram
 from ...mesh.faces import Faces
 from ..collapse import collapse_short
-from ..moves import FEW, MOVES, fewest_rejected, moved
+from ..moves import FEW, MOVES, least_bad, moved
 from .chains import Crossings, cross_cells
 from .cures import Cures, cured
 from .mend import at_wall, changed_cells, narrow_faces, rejected_at_walls, touching_walls, with_neighbors
@@ -33,7 +32,7 @@ _CERTAIN = 0.3
 _CLEAR = 1.4
 """Least distance of outer generators from the whole surface, over h: no cell is that wide at a wall."""
 _SAME = 1e-3
-"""Two outer generators or vertices of walls are at the same place if they are nearer than this share of the least h."""
+"""Two outer generators are at the same place if they are nearer to each other than this share of the least h."""
 EXACT, FILLED, ROUNDED = range(3)
 """How the walls of a cell are made: with all creases; without concave creases; without creases.
 
@@ -46,10 +45,10 @@ _AROUND = 0.85
 _OBLIQUE, _OFF_CENTER = 20.0, 0.15
 """Angle in degrees between a face and the line through the centroids of both cells, from which their generators are
 moved to the centroids; least distance from these, over h."""
-_CENTERINGS = 3
+_CENTERINGS = 6
 """How often generators are moved there."""
-_WORSE = 1000
-"""How many cells with such faces are as bad as a cell that OpenFOAM rejects."""
+_REJECTED = 1000.0
+"""How bad a cell is that OpenFOAM rejects. A face is as bad as the square of its angle over `_OBLIQUE`, less 1."""
 _MANY, _SHARE = 250, 0.05
 """So many rejected cells, and such a share of those at walls, are more than cures can mend in a time like the run's."""
 _GOLDEN = (5**0.5 - 1) / 2
@@ -59,13 +58,9 @@ _BESIDE = 1.3
 """Distance over h up to which walls become simpler around rejected cells whose walls have no creases any more."""
 _CREASED = 3.0
 """Distance from all creases, over h, beyond which a cell has the same walls however they are made."""
-_RIM, _FLAT, _ALONG = 0.22, 0.05, 0.98
-"""A face that lies along the surface may end at a concave crease, and its plane goes on beside the wall beyond it:
-vertices there, up to this share of h away, count as on the surface at this share of the usual distance only. Least
-product of both normals."""
-_CHORDS = 4
-"""Largest distance of a crossing from the middle of its chord, over the length of this: a crease in the plane of a face
-may cross it anywhere."""
+_RIM, _FLAT = 0.22, 0.05
+"""Vertices beyond a facet that is narrower than `SNAP_CREASE`, up to this share of h from a concave crease, count as on
+it at this share of the usual distance only: the faces between the cells on both sides go on into the thin part."""
 _MISSED = 0.1
 """A crossing of a crease becomes a vertex of a chord on its face that is farther from it than this share of h."""
 
@@ -236,13 +231,12 @@ def solid_diagram(
             move = goes_on[:number].count(False)
             trial[:, :3] = moved(surface.solid, depth, sizes, state[:, :3], rows, move, held)
             trial[rows, 3] = EXACT
-            if not surface.has_narrow(sizes):
-                return trial
-            # Generators around concave creases stay, unless OpenFOAM rejects their own cells.
-            beside = np.setdiff1d(np.flatnonzero((trial[:, :3] != state[:, :3]).any(axis=1)), rows)
-            edge = surface.nearest_crease(state[beside, :3], _AROUND * sizes[beside])[0]
-            beside = beside[edge >= 0][surface.solid.creases.concave[edge[edge >= 0]]]
-            trial[beside, :3] = state[beside, :3]
+            if surface.widths.min() < SNAP_CREASE * sizes.max(initial=0.0):
+                # Generators around narrow facets stay, unless OpenFOAM rejects their own cells.
+                beside = np.setdiff1d(np.flatnonzero((trial[:, :3] != state[:, :3]).any(axis=1)), rows)
+                edge = surface.nearest_crease(state[beside, :3], _AROUND * sizes[beside])[0]
+                beside = beside[edge >= 0][surface.solid.creases.concave[edge[edge >= 0]]]
+                trial[beside, :3] = state[beside, :3]
             return trial
         creased = rows[surface.nearest_crease(state[rows, :3], _CREASED * sizes[rows])[0] >= 0]
         rounded = creased[state[creased, 3] == ROUNDED]
@@ -254,15 +248,17 @@ def solid_diagram(
     def depth(x: np.ndarray) -> np.ndarray:
         return -surface.closest(x)[2]
 
-    def rejected_generators(made: _Made) -> np.ndarray:
-        return made.near.numbers[made.home[made.rejected]]
+    def rejected(made: _Made) -> np.ndarray:
+        n = len(sizes) + 1
+        return np.bincount(made.near.numbers[made.home[made.rejected]] % n, minlength=n).astype(float)
 
-    def oblique_generators(made: _Made) -> np.ndarray:
-        faces, numbers = made.faces, made.near.numbers[made.home]
-        inner = slice(faces.n_inner)
-        pairs = numbers[np.stack([faces.owner[inner], faces.neighbor[inner]])]
-        pairs = pairs[:, (faces.measures.non_orthogonality[inner] > _OBLIQUE) & (pairs >= 0).all(axis=0)]
-        return np.concatenate([np.repeat(rejected_generators(made), _WORSE), pairs.ravel()])
+    def oblique(made: _Made) -> np.ndarray:
+        inner = slice(made.faces.n_inner)
+        pairs = made.near.numbers[made.home][np.stack([made.faces.owner[inner], made.faces.neighbor[inner]])]
+        excess = np.maximum(made.faces.measures.non_orthogonality[inner] / _OBLIQUE - 1, 0) ** 2
+        excess[(pairs < 0).any(axis=0)] = 0
+        n = len(sizes) + 1
+        return _REJECTED * rejected(made) + np.bincount(pairs.ravel() % n, np.tile(excess, 2), n)
 
     def center(state: np.ndarray, rows: np.ndarray, number: int) -> np.ndarray:
         del number
@@ -280,12 +276,12 @@ def solid_diagram(
     state = np.column_stack([points, np.full(len(points), EXACT)])
     first = remake(state, None)
     assert first is not None
-    mesh = fewest_rejected(first, state, sizes, rejected_generators, change, remake, goes_on)
+    mesh = least_bad(first, state, sizes, rejected, change, remake, goes_on)
     state[:, :3], state[:, 3] = mesh.near.points, EXACT
     state[mesh.near.rows, 3] = mesh.walls[:-1]
     latest[:] = [mesh]
     trials = [True] * _CENTERINGS if centers else []
-    centered = fewest_rejected(mesh, state, sizes, oblique_generators, center, remake, trials)
+    centered = least_bad(mesh, state, sizes, oblique, center, remake, trials)
     mesh = min(centered, mesh, key=lambda made: len(made.rejected))
     tell("cells without walls")
     faces, home = mesh.near.put_back(mesh.faces, mesh.home, mesh.own)
@@ -422,20 +418,6 @@ def diagram_of(faces: Faces) -> Diagram:
     return diagram
 
 
-def _lie_along(normals: np.ndarray, across: np.ndarray, corners: np.ndarray, vertices: np.ndarray) -> np.ndarray:
-    """Return for each of `vertices` (k,) with the `normals` (k, 3) of the surface whether a face lies along it.
-
-    `corners` (m,) are the vertices of faces, `across` (m, 3) unit normals of the face of each.
-    """
-    place = np.full(int(corners.max(initial=-1)) + 1, -1)
-    place[vertices] = np.arange(len(vertices))
-    rows = np.flatnonzero(place[corners] >= 0)
-    flat = np.abs((across[rows] * normals[place[corners[rows]]]).sum(axis=1)) > _ALONG
-    found = np.zeros(len(vertices), bool)
-    found[place[corners[rows[flat]]]] = True
-    return found
-
-
 class _Maker:
     """Makes the mesh; vertices are those of the diagram, then piercings of edges, crossings of creases, and corners.
 
@@ -453,7 +435,6 @@ class _Maker:
         self.owner, self.neighbor = self.cells.owner, self.cells.neighbor
         self.starts, self.corners, self.points = self.cells.starts, self.cells.corners, self.cells.points
         self.n, self.at_wall = len(self.sizes), near.at_wall
-        self.narrow = surface.has_narrow(near.sizes[:-1])
         self.filled, self.rounded = walls >= FILLED, walls == ROUNDED
 
     def mesh(self) -> _Made:
@@ -461,8 +442,6 @@ class _Maker:
         touches = self.at_wall[self.owner] & self.at_wall[self.neighbor]
         near, far = np.flatnonzero(touches), np.flatnonzero(~touches)
         parts = self._to_creases(self._trim(near))
-        if self.narrow:
-            parts = self._welded(parts)
         return self._assemble(far, parts, self._wall_polygons(parts, far))
 
     def _certified(self, starts: np.ndarray, corners: np.ndarray, near: np.ndarray) -> np.ndarray:
@@ -497,14 +476,11 @@ class _Maker:
         free = np.zeros(len(self.points), bool)
         free[corners[at_filled]] = True
         at_wall = used[signed[used] > -_CERTAIN * h[used]]
-        across = self.generators[self.neighbor[near]] - self.generators[self.owner[near]]
-        across = np.repeat(across / np.linalg.norm(across, axis=1)[:, None], np.diff(starts), axis=0)
         for _ in range(2):
             triangle, foot, signed[at_wall] = self.surface.closest(self.points[at_wall])
             side[at_wall] = sides(signed[at_wall], h[at_wall])
-            normals, beyond = self.surface.solid.normals[triangle], signed[at_wall] > _FLAT * ON * h[at_wall]
-            beyond &= self.narrow
-            rows = np.flatnonzero(beyond & (side[at_wall] == WALL) & _lie_along(normals, across, corners, at_wall))
+            narrow = self.surface.widths[self.surface.patch[triangle]] < SNAP_CREASE * h[at_wall]
+            rows = np.flatnonzero(narrow & (signed[at_wall] > _FLAT * ON * h[at_wall]) & (side[at_wall] == WALL))
             edge = self.surface.nearest_crease(self.points[at_wall[rows]], _RIM * h[at_wall[rows]])[0]
             rows = rows[edge >= 0][self.surface.solid.creases.concave[edge[edge >= 0]]]
             side[at_wall[rows]] = OUT
@@ -557,13 +533,8 @@ class _Maker:
         crossings = crossings.take(~filled | ~self.surface.solid.creases.concave[edge])
         sites = self.surface.n_patches + crossings.edge
         middle = (self.points[parts.items[chords]] + self.points[after[chords]]) / 2
-        length = np.linalg.norm(self.points[after[chords]] - self.points[parts.items[chords]], axis=1)
-        reach = _CHORDS * length + SNAP_CREASE * np.minimum(
-            self.sizes[self.owner[face]], self.sizes[self.neighbor[face]]
-        )
-        reach[:] = reach if self.narrow else np.inf
         keys = self.owner[face] * self.n + self.neighbor[face]
-        rank = self._match(crossings, keys, one, other, middle, reach)
+        rank = self._match(crossings, keys, one, other, middle)
         left = np.flatnonzero(rank < 0)
         pairs = self._match_twice(crossings, keys[left], one[left], other[left])
         twice = np.array([left[k] for k in pairs], np.int64)
@@ -598,45 +569,13 @@ class _Maker:
         )
         return made.take(np.flatnonzero(counts >= 3))
 
-    def _welded(self, parts: TrimmedFaces) -> TrimmedFaces:
-        """Make one of vertices at the same place on a patch, where several have been moved onto a crease."""
-        used = distinct(parts.items)
-        used = used[self.site[used] >= 0]
-        tree = scipy.spatial.KDTree(self.points[used])
-        pairs = used[tree.query_pairs(_SAME * self.sizes.min(), output_type="ndarray")]
-        pairs = pairs[self.surface.common(*self.site[pairs].T)[0] > 0]
-        if not len(pairs):
-            return parts
-        label = connect(len(self.points), pairs)[1]
-        order = np.lexsort((-self.site, label))  # corners and creases stay
-        first = np.unique(label[order], return_index=True)[1]
-        items, chord = order[first][label[parts.items]], parts.chord
-        row = np.repeat(np.arange(len(parts.face)), np.diff(parts.starts))
-        while True:
-            starts = np.searchsorted(row, np.arange(len(parts.face) + 1))
-            after = following(starts)
-            gone = items[after] == items
-            spike = (items[after[after]] == items) & ~gone
-            gone[spike] = gone[after[spike]] = True
-            if not gone.any():
-                break
-            items, chord, row = items[~gone], chord[~gone], row[~gone]
-        made = TrimmedFaces(parts.face, starts, items, chord)
-        return made.take(np.flatnonzero(np.diff(starts) >= 3))
-
     def _match(
-        self,
-        crossings: Crossings,
-        face: np.ndarray,
-        one: np.ndarray,
-        other: np.ndarray,
-        middle: np.ndarray,
-        reach: np.ndarray,
+        self, crossings: Crossings, face: np.ndarray, one: np.ndarray, other: np.ndarray, middle: np.ndarray
     ) -> np.ndarray:
         """Return for each chord the crossing on its face that lies on patches of both ends, the nearest; or -1.
 
-        `face` (k,) are keys of faces, `one` and `other` (k,) the sites of the ends, `middle` (k, 3) middles of chords,
-        and `reach` (k,) how far from these it may be.
+        `face` (k,) are keys of faces, `one` and `other` (k,) the sites of the ends, and `middle` (k, 3) the middles of
+        chords.
         """
         found = np.full(len(face), -1)
         key = crossings.cells[:, 0] * self.n + crossings.cells[:, 1]
@@ -647,8 +586,6 @@ class _Maker:
         fits = (self.surface.common(site, one[row])[0] > 0) & (self.surface.common(site, other[row])[0] > 0)
         row, which = row[fits], which[fits]
         far = ((crossings.points[which] - middle[row]) ** 2).sum(axis=1)
-        near = far <= reach[row] ** 2
-        row, which, far = row[near], which[near], far[near]
         order = np.lexsort((far, row))
         first = np.unique(row[order], return_index=True)[1]
         found[row[order[first]]] = which[order[first]]
@@ -677,7 +614,6 @@ class _Maker:
         share = ((x - a) * along).sum(axis=1) / np.maximum((along**2).sum(axis=1), 1e-300)
         away = np.linalg.norm(x - a - np.clip(share, 0, 1)[:, None] * along, axis=1)
         far = away > _MISSED * self.sizes[crossings.cells[which, 0]]
-        far &= (away < _CHORDS * np.linalg.norm(along, axis=1)) | (not self.narrow)
         rows = np.flatnonzero(fits & far)
         order = rows[np.lexsort((-away[rows], chord[rows]))]
         first = np.unique(chord[order], return_index=True)[1]
@@ -780,23 +716,14 @@ class _Maker:
         return label
 
     def _labels(self, cell: np.ndarray, begin: np.ndarray, end: np.ndarray) -> np.ndarray:
-        """Return the patch of each side at a wall: the one that both ends are on, or else the nearest to its middle.
-
-        Vertices on a facet narrower than `SNAP_CREASE` may lie on the patch beside it, too, and the nearest one counts.
-        """
+        """Return the patch of each side at a wall: that of both ends, or the nearest to its middle."""
         count, label = self.surface.common(self.site[begin], self.site[end])
-        rows = np.flatnonzero((count != 1) | (self.surface.widths[label] < SNAP_CREASE * self.sizes[cell]))
+        rows = np.flatnonzero(count != 1)
         middle = (self.points[begin[rows]] + self.points[end[rows]]) / 2
         middle += 0.05 * (self.generators[cell[rows]] - middle)
         near = self.surface.patch[self.surface.closest(middle)[0]].astype(np.int64)
-        fits = np.ones(len(rows), bool)
-        for ends in (begin[rows], end[rows]):
-            off = (self.surface.common(near, self.site[ends])[0] == 0) & (count[rows] > 0)
-            narrow = np.flatnonzero(off & (count[rows] == 1))
-            away = self.surface.solid.wall_distance(near[narrow], self.points[ends[narrow]])
-            off[narrow] = away > ON * self.sizes[cell[rows[narrow]]]
-            fits &= ~off
-        label[rows[fits]] = near[fits]
+        fits = [self.surface.common(near, self.site[ends[rows]])[0] > 0 for ends in (begin, end)]
+        label[rows] = np.where(np.all(fits, axis=0) | (count[rows] == 0), near, label[rows])
         return label
 
     def _assemble(self, far: np.ndarray, parts: TrimmedFaces, divider: Divider) -> _Made:

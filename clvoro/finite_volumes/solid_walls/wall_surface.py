@@ -58,10 +58,6 @@ class WallSurface:
         area = np.bincount(self.patch, self.solid.surface.areas, self.n_patches) * self.solid.extent.max() ** 2
         return 2 * area / np.maximum(around, 1e-300)
 
-    def has_narrow(self, sizes: np.ndarray) -> bool:
-        """Return whether vertices on some patch are near creases on both of its sides, for cells of `sizes` (n,)."""
-        return bool(self.widths.min() < SNAP_CREASE * sizes.max(initial=0.0))
-
     def closest(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the closest triangle (k,), the point on it (k, 3), and the distance (k,), negative inside."""
         return self.solid.closest(points, None if self._nearest is None else self._nearest(points, np.inf))

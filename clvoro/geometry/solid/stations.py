@@ -5,7 +5,8 @@ node is a ball without other generators. Beside a chord k generators stand where
 intersect, in the middle of k equal sectors. With the mean interior angle alpha of the chain, k = round(alpha / 90
 degrees); a chord where sectors would be wider than 120 degrees has more. So all their bisectors contain the chord, and
 each of the outermost two is nearest to one wall only. Two chords on both sides of a facet that is narrower than a cell,
-as at the rim of a plate, share the angle around both: the middle of the facet is the border between their sectors.
+as at the rim of a plate, share the angle around both. If they stand face to face, one generator beyond the middle of
+the facet belongs to both. Else this middle is the border between their sectors.
 Chains that meet in a corner share the node there. Generators of two chains that are near each other become one, on the
 spheres of both. Mirror images of the generators in the walls there complete the corner.
 
@@ -22,7 +23,7 @@ import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import scipy
@@ -42,6 +43,9 @@ _SHRINKAGE, _LEAST = 0.8, 0.2  # of the scale of chords whose generators have no
 _WIDEST, _WIDEST_CROWDED = math.radians(120), math.radians(150)  # sectors, and those where there is little room
 _SHORT = 0.8  # over the radius at its first end: a shorter chord has the same radius at both ends
 _NARROW = 0.75  # of h: two chords this near to each other on one patch share the sectors around both
+_NARROW_FACING, _SHIFT = 1.2, 0.05  # of h: the same for chords face to face, and how far these may be shifted
+_AROUND_FACET = math.radians(80)  # sectors, about, where two such chords have one in common
+_FLATTEST = 0.95  # cosine of the angle at a chord between the facet and the generator in the common sector, at most
 _ON_FACET, _PARALLEL = 0.2, 0.8  # of their distance: how far its middle is from the patch; product of their directions
 _TILT = math.radians(8)  # of faces between sectors against a narrow facet, at least
 _CURVED = math.radians(25)  # mean angle between neighboring chords above which a crease is a narrow curve
@@ -158,7 +162,7 @@ def _share_sectors(solid: Solid, chains: list[_Crease]) -> list[_Crease]:
     item = [(chain, i) for chain in chains for i in range(len(chain.h))]
     middle = np.concatenate([chain.spots for chain in chains])
     ways, h, angle = (np.concatenate([getattr(c, name) for c in chains]) for name in ("ways", "full", "angle"))
-    near = scipy.spatial.KDTree(middle).query_pairs(_NARROW * math.sqrt(2) * h.max(), output_type="ndarray")
+    near = scipy.spatial.KDTree(middle).query_pairs(_NARROW_FACING * h.max(), output_type="ndarray")
     i, j = np.concatenate([near, near[:, ::-1]]).T
     # Chords on both sides may be shifted along the facet.
     gap = middle[j] - middle[i]
@@ -171,13 +175,21 @@ def _share_sectors(solid: Solid, chains: list[_Crease]) -> list[_Crease]:
         facing[:, side] = (walls[i] * toward).sum(axis=1), -(walls[j] * toward).sum(axis=1)
     facet = facing.argmax(axis=1)
     same = (ways[i] * ways[j]).sum(axis=1) * np.where(facet[0] == facet[1], -1, 1)
-    good = (width < _NARROW * h[i]) & (np.abs(gap - across).max(axis=1) < _NARROW * h[i])
+    mean = ways[i] + np.sign((ways[i] * ways[j]).sum(axis=1))[:, None] * ways[j]
+    opposite = np.abs((gap * mean).sum(axis=1)) < _SHIFT * h[i] * np.linalg.norm(mean, axis=1)
+    good = width < np.where(opposite, _NARROW_FACING, _NARROW) * h[i]
+    good &= np.linalg.norm(gap - across, axis=1) < _NARROW * h[i]
     good &= (facing.max(axis=1) > _PARALLEL).all(axis=0) & (same > _PARALLEL)
     good &= np.minimum(angle[i], angle[j]) > math.pi
     good[good] = np.abs(solid.signed_distance(middle[i[good]] + 0.5 * across[good])) < _ON_FACET * width[good]
-    for k in np.flatnonzero(good)[np.argsort(-width[good], kind="stable")].tolist():  # the nearest last
+    rows = np.flatnonzero(good)[np.lexsort((-width[good], opposite[good]))]  # the best last
+    partner = dict(zip(i[rows].tolist(), j[rows].tolist(), strict=True))
+    for k in rows.tolist():
         chain, row = item[i[k]]
-        chain.share(row, 0.5 * (angle[i[k]] + angle[j[k]] - math.pi), bool(facet[0, k] == 1))
+        if opposite[k] and partner[int(j[k])] == i[k]:
+            chain.share_common(row, float((gap[k] ** 2).sum() / width[k]), bool(facet[0, k] == 1))
+        else:
+            chain.share(row, 0.5 * (angle[i[k]] + angle[j[k]] - math.pi), bool(facet[0, k] == 1))
     shared = {v for c in chains for v, end in zip(c.vertices.tolist(), (0, -1), strict=True) if c.shared[end]}
     return [c for c in chains if c.line.at[-1] > _NARROW * c.full[0] or not shared.issuperset(c.vertices.tolist())]
 
@@ -257,6 +269,14 @@ class ChainOfChords:
         return self.nodes[i] + foot * way + height * (np.cos(turn)[:, None] * one + np.sin(turn)[:, None] * other)
 
 
+def _reach(half: Any) -> Any:
+    """Return the distance of generators from a crease over h, in sectors twice as wide as `half`.
+
+    A cell is a kite with the area h^2 whose tip is on the crease; its generator is at the centroid.
+    """
+    return (np.cos(half) + 1 / np.cos(half)) / (3 * np.sqrt(np.tan(half)))
+
+
 class _Crease(ChainOfChords):
     """A concave crease: generators in the middle of equal sectors of its interior angle.
 
@@ -272,6 +292,8 @@ class _Crease(ChainOfChords):
         The number of generators around each chord.
     span : (n,) float
         The angle that they divide.
+    facet : (n,) float
+        The width of a facet beyond whose middle the last sector is; NaN elsewhere.
     shared, turned : (n,) bool
         Whether it is less than `angle`, since there is another crease on a narrow facet; and whether it ends, not
         begins, at the left wall.
@@ -288,6 +310,7 @@ class _Crease(ChainOfChords):
         sine, cosine = (np.cross(left, right) * self.ways).sum(axis=1), (left * right).sum(axis=1)
         self.angle = math.pi - np.arctan2(sine, cosine)
         self.span, (self.shared, self.turned) = self.angle.copy(), np.zeros((2, len(self.h)), bool)
+        self.facet = np.full(len(self.h), np.nan)
         # Where the number changes along the chain, faces between cells are oblique.
         usual = np.rint(self.angle.mean() / (math.pi / 2)) if len(self.angle) else 2
         self.sectors = np.maximum(usual, np.ceil(self.angle / _WIDEST)).astype(int)
@@ -297,13 +320,20 @@ class _Crease(ChainOfChords):
     def _arrange(self) -> None:
         """Set the sizes, angles and radii that follow from scale and sectors."""
         self.h = self.full * self.scale
+        for i in np.flatnonzero(self.facet >= 0).tolist():
+            radius = self.h[i]
+            for _ in range(_ITERATIONS):
+                turn = self.angle[i] - math.acos(min(0.5 * self.facet[i] / radius, _FLATTEST))
+                n = max(round(turn / _AROUND_FACET - 0.5), 1)
+                half = 0.5 * turn / (n + 0.5)
+                radius = self.h[i] * _reach(half)
+            self.sectors[i], self.span[i] = n + 1, 2 * half * (n + 1)
         self.turns = [
             (np.arange(n) + 0.5) * (a / max(n, 1)) for n, a in zip(self.sectors.tolist(), self.span, strict=True)
         ]
         self.turns = [a - t if back else t for t, a, back in zip(self.turns, self.angle, self.turned, strict=True)]
         half = 0.5 * self.span / np.where(self.sectors, self.sectors, 2)
-        # A cell is a kite with the area h^2 whose tip is on the crease; its generator is at the centroid.
-        self.set_radii(self.h / np.sqrt(np.tan(half)) * (np.cos(half) + 1 / np.cos(half)) / 3)
+        self.set_radii(self.h * _reach(half))
 
     @property
     def sized(self) -> np.ndarray:
@@ -315,6 +345,11 @@ class _Crease(ChainOfChords):
         """Return the direction (3,) from a chord into the wall to its left, `side` 0, or to its right, 1."""
         turn, (one, other) = side * self.angle[chord], self.axes[chord]
         return math.cos(turn) * one + math.sin(turn) * other
+
+    def share_common(self, chord: int, width: float, facet_right: bool) -> None:
+        """Let the last sector be common to the chords on both sides of a facet of this `width`: beyond its middle."""
+        self.facet[chord], self.shared[chord], self.turned[chord] = width, True, not facet_right
+        self._arrange()
 
     def share(self, chord: int, span: float, facet_right: bool) -> None:
         """Divide only the angle `span` around a chord, from the wall that is not the facet."""
@@ -336,13 +371,13 @@ class _Crease(ChainOfChords):
         self.scale[crowded] *= _SHRINKAGE
         fewest = np.ceil(self.span / _WIDEST_CROWDED).astype(int)
         again = crowded & (self.scale < _LEAST) & (fewest < self.sectors)
-        self.sectors[again], self.scale[again] = fewest[again], 1
+        self.sectors[again], self.scale[again], self.facet[again] = fewest[again], 1, np.nan
         self._arrange()
         return bool(crowded.any())
 
     def leave_out(self, chords: np.ndarray) -> None:
         """Leave out the generators at `chords` (n,) bool."""
-        self.sectors[chords] = 0
+        self.sectors[chords], self.facet[chords] = 0, np.nan
         self._arrange()
 
 
@@ -443,7 +478,7 @@ class AroundCreases:
             return
         kept = np.ones(len(self.points), bool)
         for i, j in self.near_pairs():
-            if not kept[i] or not kept[j] or self.chains[i] == self.chains[j]:
+            if not kept[i] or not kept[j]:
                 continue
             balls = self.balls[i] + self.balls[j]
             point = self.common_point(0.5 * (self.points[i] + self.points[j]), balls)
