@@ -90,8 +90,9 @@ def cache_remedy() -> str:
         home = Path("~/.cache")
     pocl = os.environ.get("POCL_CACHE_DIR") or home / "pocl"
     return (
-        f"If kernels in a cache are damaged (after a power cut, say), remove {pocl} and {home / 'pytools'}; if "
-        "its disk is full or not writable, set XDG_CACHE_HOME to another folder"
+        "If kernels in a cache are damaged (after a power cut, say), or a process that was killed has left the file "
+        f"`lock` in it (others then fail after a minute), remove {pocl}, {home / 'pyopencl'} and {home / 'pytools'}; "
+        "if its disk is full or not writable, set XDG_CACHE_HOME to another folder"
     )
 
 
