@@ -331,7 +331,13 @@ class Solid(Domain):
             raise InputError(f"Solid.outside box is {box}, expected a box with walls; leave out `periodic`")
         lower, upper = (box.lower, box.upper) if isinstance(box, Box) else box
         frame = cls.box(lower, upper, names=box.names if isinstance(box, Box) else None)
-        return cls(**{**around(of, frame), "angle": of.angle, **options})
+        made = around(of, frame)
+        if of.angle >= 90:  # the edges of the box stay creases
+            x, triangles = made["vertices"], made["triangles"]
+            on = np.isclose(np.hstack([x, x]), np.hstack([lower, upper]), rtol=0, atol=_ON * frame.extent.max())
+            ends = np.stack([triangles, np.roll(triangles, -1, axis=1)], axis=2).reshape(-1, 2)
+            made["creases"] = np.unique(np.sort(ends[on[ends].all(axis=1).sum(axis=1) > 1], axis=1), axis=0)
+        return cls(**{**made, "angle": of.angle, **options})
 
     def __add__(self, other: Solid) -> Solid:
         return self._combined(other, "+")

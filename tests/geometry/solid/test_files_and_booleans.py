@@ -184,6 +184,8 @@ def test_a_wrap_is_closed_around_all_triangles(vertices, triangles, volume):
         solid = Solid(vertices, triangles, group_names=["body"], wrap=0.2)
     assert solid.measure == pytest.approx(volume, rel=0.1)
     assert (len(caught), len(solid.creases), solid.boundary_names) == (1, 0, ("body",))
+    air = Solid.outside(solid, Box((-1, -1, -1), (3, 3, 3), names={"sides": range(6)}))
+    assert (air.n_patches, air.boundary_names) == (7, ("sides", "body"))
     given = vertices[np.unique(triangles)]
     assert solid.contains(given).all()
     assert solid.boundary_distance(given).min() > 0.06
