@@ -21,6 +21,8 @@ _STEPS, _BESIDE = (0.1, 0.15, 0.2, 0.25, 0.3), 1.3
 """Displacements of generators of rejected cells, in turn, and distance up to which others move as well, over h."""
 _GROUP = 2.5
 """Distance over h up to which rejected cells are in one group."""
+_RETURNS = 4
+"""Largest number of meshes in which groups are changed back."""
 _DEEP = 0.1
 """Least distance of moved generators from the boundary of the domain, over h."""
 _NEAR, _MIRRORED = 0.75, 0.2
@@ -64,7 +66,7 @@ def least_bad(
         the best state so far.
     """
     best, last, bad, points = first, first, badness(first), state[:, :3]
-    least = bad.sum()
+    least, begun, given = bad.sum(), state, bad
     tried, new = state, bad
     for number, further in enumerate(goes_on):
         base, of = (tried, new) if further else (state, bad)
@@ -77,9 +79,8 @@ def least_bad(
         last, tried, new = made, trial, badness(made)
         if new.sum() < least:
             best, least = made, new.sum()
-        had, found = np.flatnonzero(bad[:-1]), np.flatnonzero(bad[:-1] + new[:-1])
-        count, group = _groups(points, sizes, found)
-        before, after = (np.bincount(group, values[found], count) for values in (bad, new))
+        found, group, before, after = _compared(points, sizes, bad, new)
+        had = np.flatnonzero(bad[:-1])
         changed = np.flatnonzero((trial != state).any(axis=1))
         at = had[scipy.spatial.KDTree(points[had]).query(points[changed])[1]]
         changed = changed[(after < before)[group[np.searchsorted(found, at)]]]
@@ -87,9 +88,30 @@ def least_bad(
         state[changed] = trial[changed]
         replaced = ((after < before) | (before == 0))[group]
         bad = np.bincount(found, np.where(replaced, new[found], bad[found]), len(bad))
-    if bad.sum() < least and (made := remake(state, last)) is not None:
-        best = min(best, made, key=lambda mesh: badness(mesh).sum())
+    # Groups were judged in several meshes. Those that are worse in one mesh than at first are changed back.
+    for _ in range(_RETURNS if bad.sum() < least else 0):
+        if (made := remake(state, best)) is None:
+            break
+        new = badness(made)
+        if new.sum() < least:
+            best, least = made, new.sum()
+        found, group, before, after = _compared(points, sizes, given, new)
+        changed = np.flatnonzero((state != begun).any(axis=1))
+        changed = changed[(after > before)[group[scipy.spatial.KDTree(points[found]).query(points[changed])[1]]]]
+        if not len(changed):
+            break
+        state = state.copy()
+        state[changed] = begun[changed]
     return best
+
+
+def _compared(
+    points: np.ndarray, sizes: np.ndarray, before: np.ndarray, after: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return the generators (k,) that are bad before or after, their groups (k,), and how bad each group is (g,)."""
+    found = np.flatnonzero(before[:-1] + after[:-1])
+    count, group = _groups(points, sizes, found)
+    return found, group, *(np.bincount(group, values[found], count) for values in (before, after))
 
 
 def _groups(points: np.ndarray, sizes: np.ndarray, rows: np.ndarray) -> tuple[int, np.ndarray]:

@@ -51,7 +51,7 @@ def test_pairs_stay_mirror_images_in_all_patches_between_them():
 def test_the_mesh_of_the_least_bad_cells_is_kept():
     """What changed in a group stays if it is less bad then. Trials go on from there, or from the one before."""
     state = np.column_stack([np.arange(300) * 3.0, np.zeros((300, 3))])
-    begun = []
+    begun, made = [], []
 
     def change(now, rows, number):
         begun.append((np.flatnonzero(now[:, 3]).tolist(), rows.tolist(), number))
@@ -63,7 +63,11 @@ def test_the_mesh_of_the_least_bad_cells_is_kept():
         def badness(mesh):
             return np.bincount(np.array(mesh, int) % 301, minlength=301).astype(float)
 
-        return least_bad(first, state, np.ones(300), badness, change, lambda now, last: next(meshes), goes_on)
+        def remake(now, last):
+            made.append((np.flatnonzero(now[:, 3]).tolist(), last))
+            return next(meshes)
+
+        return least_bad(first, state, np.ones(300), badness, change, remake, goes_on)
 
     first, better = [0, 1, 1, 100, 200], [0, 1, 200, -1]
     assert kept(first, [better, [0, 0, 1, 200], None, [0, 1]], [False] * 4) == [0, 1]
@@ -77,3 +81,8 @@ def test_the_mesh_of_the_least_bad_cells_is_kept():
     assert kept([0, 100], [[0, 0, 100], [100], []], [False, False, True, False]) == []
     assert begun == [([], [0, 100], 0), ([], [0, 100], 1), ([0, 100], [0, 100], 2), ([0], [100], 3)]
     assert kept([], [], [False]) == []
+    # What was kept is worse in one mesh at 0, and is changed back there.
+    made.clear()
+    worse, best = [0, 0, 200], [0, 200]
+    assert kept([0, 100, 200], [[200] * 3, worse, best], [False]) == best
+    assert made == [([0, 100, 200], [0, 100, 200]), ([0, 100], [0, 100, 200]), ([100], [0, 100, 200])]
