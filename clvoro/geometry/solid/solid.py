@@ -216,6 +216,8 @@ class Solid(Domain):
             given, group, self.repairs, holes = repaired(given, group, len(known))
             self._group_names += tuple(f"hole-{k + 1}" for k in range(holes))
         if wrap is not None:
+            if creases is not None:
+                raise InputError(f"{name} has creases and wrap, expected one of them: a wrap has other vertices")
             given, done = wrapped(given, wrap)
             group, self.repairs = np.zeros(len(given), np.int64), (*self.repairs, done)
             self._group_names = ("wall",) if len(known) > 1 else tuple(known)

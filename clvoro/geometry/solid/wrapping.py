@@ -37,21 +37,27 @@ def wrapped(surface: Surface, reach: float) -> tuple[Surface, str]:
     Raises
     ------
     InputError
-        If `reach` is no length, or so small that the grid would have too many points.
+        If `reach` is no length, longer than the surface, or so small that the grid would have too many points.
     MissingLibraryError
         If manifold3d is not installed.
     """
-    if not (isinstance(reach, Real) and 0 < reach < math.inf):
+    if isinstance(reach, bool) or not (isinstance(reach, Real) and 0 < reach < math.inf):
         raise InputError(f"{surface.name} wrap is {reach!r}, expected a length")
+    reach, longest = float(reach), float(np.ptp(surface.vertices, axis=0).max())
+    if reach > longest:
+        raise InputError(
+            f"{surface.name} wrap is {reach:g}, longer than the surface, {longest:g}; give it in the unit of the "
+            "solid, which is meters with `units`"
+        )
     step = reach / _STEP
     low = surface.vertices.min(axis=0) - reach - 3 * step
-    shape = np.ceil((surface.vertices.max(axis=0) + reach + 3 * step - low) / step).astype(int) + 1
+    shape = np.ceil((surface.vertices.max(axis=0) + reach + 3 * step - low) / step) + 1
     if (count := math.prod(shape.tolist())) > _MOST:
         least = reach * (count / _MOST) ** (1 / 3)
         raise InputError(
             f"{surface.name} wrap is {reach:g}, which is too small for its extent; use {least:.2g} or more"
         )
-    grid = _Sampled(low, step, shape)
+    grid = _Sampled(low, step, shape.astype(int))
     away = grid.distance(surface, 2 * reach)
     part = scipy.ndimage.label(away > reach)[0]
     outer = part == part[0, 0, 0]

@@ -171,17 +171,18 @@ def test_repair_mends_what_is_certain_and_says_so(vertices, triangles, says, vol
 
 
 @pytest.mark.parametrize(
-    ("vertices", "triangles", "volume"),
+    ("vertices", "triangles", "wrap", "volume"),
     [
-        (V, T[:2], 0.267),  # a sheet: a plate with round edges
-        (V, T[2:], 1.0),  # five sides of a cube: a hollow one
-        (V, sides(V, 2)[1:], 0.8),
-        (np.vstack([V, V + 0.5]), np.vstack([T, T[:2], T + 8]), 3.07),  # cubes that cross, and triangles twice
+        (V, T[:2], np.float32(0.2), 0.267),  # a sheet: a plate with round edges
+        (V, T[2:], 0.2, 1.0),  # five sides of a cube: a hollow one
+        (V, sides(V, 2)[1:], 0.2, 0.8),
+        (np.vstack([V, V + 0.5]), np.vstack([T, T[:2], T + 8]), 0.2, 3.07),  # cubes that cross, and triangles twice
+        (V, T, 1, 5.8),  # an integer
     ],
 )
-def test_a_wrap_is_closed_around_all_triangles(vertices, triangles, volume):
+def test_a_wrap_is_closed_around_all_triangles(vertices, triangles, wrap, volume):
     with pytest.warns(MismatchWarning, match="wrapped, at most 0") as caught:
-        solid = Solid(vertices, triangles, group_names=["body"], wrap=0.2)
+        solid = Solid(vertices, triangles, group_names=["body"], wrap=wrap)
     assert solid.measure == pytest.approx(volume, rel=0.1)
     assert (len(caught), len(solid.creases), solid.boundary_names) == (1, 0, ("body",))
     air = Solid.outside(solid, Box((-1, -1, -1), (3, 3, 3), names={"sides": range(6)}))
@@ -211,7 +212,10 @@ def test_edges_sharper_than_ten_degrees_are_warned_of():
         ({"creases": [(0, 99)]}, "creases have vertices up to 99"),
         ({"names": {"inlet": "nowhere"}}, "nowhere"),
         ({"wrap": -1}, "wrap is -1, expected a length"),
-        ({"wrap": 1e-4}, "too small for its extent"),
+        ({"wrap": True}, "wrap is True, expected a length"),
+        ({"wrap": 1e-20}, "too small for its extent"),
+        ({"wrap": 20}, "wrap is 20, longer than the surface, 1; .* unit"),
+        ({"wrap": 0.2, "creases": [(0, 1)]}, "creases and wrap"),
     ],
 )
 def test_wrong_options_are_refused(options, says):
