@@ -560,7 +560,7 @@ class _Loop:
         axes.set_title("")
         axes.set_title(f"cycle {row.cycle}: {old.foam.n_cells:,} cells{place and ', '}{place}", loc="left")
         own = self.case.own
-        figure.savefig(own / f"cycle-{row.cycle}.png", dpi=150)
+        figure.savefig(own / f"cycle-{row.cycle}.png", dpi=150, bbox_inches="tight")
         pyplot.close(figure)
         paths = [own / f"cycle-{k}.png" for k in range(row.cycle + 1)]
         parts = [image.imread(path) for path in paths if path.exists()]

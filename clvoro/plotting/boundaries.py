@@ -9,7 +9,7 @@ from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.colors import to_rgb
 from matplotlib.patches import Patch
 
-from ..errors import InputError
+from ..errors import InputError, InputTypeError
 from ..geometry.domain import Domain
 from ..io.convert import missing
 from .cells import frame_part
@@ -54,12 +54,16 @@ def plot_boundaries(domain: Domain, ax: Any = None, *, numbers: bool = False) ->
 
     Raises
     ------
-    InputError
-        For a domain on a sphere or periodic in all directions, or if axes are given for a domain in 3D.
+    InputError, InputTypeError
+        For a mesh, for a domain on a sphere or periodic in all directions, or if axes are given for a domain in 3D.
     MissingLibraryError
         If trimesh is not installed, in 3D (``pip install "clvoro[solids]"``).
     """
+    if not isinstance(domain, Domain):
+        raise InputTypeError(f"domain is a {type(domain).__name__}, expected a domain; that of a mesh is mesh.domain")
     domain.require_flat("plot_boundaries draws domains in the plane and in space", "call result.plot()")
+    if not domain.boundary_names:
+        raise InputError(f"{domain!r:.80} has no boundary: it is periodic in all directions")
     with styled():
         if domain.cell_dim == 3:
             if ax is not None:

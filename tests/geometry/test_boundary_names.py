@@ -249,6 +249,10 @@ def test_plots_show_the_names(meshed) -> None:
     assert plot_boundaries(clvoro.Box((0, 0), (1, 1)), over.axes[0]) is over
     with pytest.raises(InputError, match="in the plane and in space"):
         plot_boundaries(clvoro.Sphere(1))
+    with pytest.raises(InputError, match="no boundary"):
+        plot_boundaries(clvoro.Box((0, 0, 0), (1, 1, 1), periodic=True))
+    with pytest.raises(InputTypeError, match=r"mesh\.domain"):
+        plot_boundaries(figure)
 
 
 @pytest.mark.parametrize(
