@@ -197,7 +197,7 @@ class SolverMeasures:
         cell, areas, n = cell[kept], self.geometry.areas[face[kept]], self.mesh.n_cells
         mean = np.bincount(cell, np.linalg.norm(areas, axis=1), n)
         counts = np.bincount(cell, minlength=n)
-        scaled = areas / (mean / np.maximum(counts, 1))[cell][:, None]
+        scaled = areas / np.maximum(mean / np.maximum(counts, 1), _TINY)[cell][:, None]
         products = (scaled[:, :, None] * scaled[:, None, :]).reshape(-1, 9)
         tensors = sum_rows(cell, products, n).reshape(-1, 3, 3)
         for a in range(self.mesh.dim, 3):

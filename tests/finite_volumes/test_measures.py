@@ -1,6 +1,7 @@
 """Measures of solver meshes: cubes by hand, and the figures that OpenFOAM's checkMesh prints."""
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -123,6 +124,7 @@ def test_cubes_by_hand():
     assert not m.concave.any()
     assert m.determinant.min() > 0.01
     assert mesh.area_change == 0
+    assert (replace(mesh, points=0 * mesh.points).measures.determinant == 0).all()
 
 
 def test_centroids_and_concavity_in_2d_are_those_of_polygons(ctx):
