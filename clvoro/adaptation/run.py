@@ -566,7 +566,8 @@ class Run:
         The device's cells at curved walls are a little different from those of the diagram.
         """
         length = np.cbrt(diagram.volumes)
-        error = (length - size) / np.minimum(length, size)
+        with np.errstate(divide="ignore"):  # cells without volume have the error -inf
+            error = (length - size) / np.minimum(length, size)
         quality = cell_quality(diagram, np.add.reduceat(diagram.face_measures, diagram.neighbor_starts[:-1]))
         row = self.rows[-1]
         more = len(diagram) - int(row["cells"][0])
