@@ -16,7 +16,7 @@ import numpy as np
 from ...mesh.faces import Faces
 from .cutting import CellCut, planes_through
 from .editing import Edge, Edits, Matches, area_of, between, edges_of, judge
-from .mend import rejected_at_walls, with_neighbors
+from .mend import rejected_among, touching_walls, with_neighbors
 from .wall_surface import WallSurface
 
 _SNAPS = (0.1, 0.03)
@@ -480,7 +480,7 @@ def cured(
         todo = cures.edits.alive({*rejected.tolist(), *cures.edits.touched})
     made, cells = cures.edits.result()
     changed = np.isin(cells, [*rejected.tolist(), *cures.edits.touched])
-    left = rejected_at_walls(made, with_neighbors(made, changed))
+    left = rejected_among(made, with_neighbors(made, changed), changed | touching_walls(made))
     if len(left) > len(rejected):
         return faces, np.arange(faces.n_cells), own, rejected, None
     origin = np.array([cures.edits.origins.get(c, c) for c in cells.tolist()])
