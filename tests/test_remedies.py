@@ -1001,7 +1001,6 @@ ROWS = [
 
 TESTED_IN = {
     "is a geometry, expected a case": "cli/test_cli.py::test_errors_are_one_message",
-    "details finer than": "finite_volumes/test_solid_walls.py::test_a_crease_that_cannot_be_followed_is_left_out",
     "which is too small for its extent": "geometry/solid/test_files_and_booleans.py::test_wrong_options_are_refused",
     "longer than the surface": "geometry/solid/test_files_and_booleans.py::test_wrong_options_are_refused",
     "is drawn in a figure of its own": "geometry/test_boundary_names.py::test_plots_show_walls_in_space",

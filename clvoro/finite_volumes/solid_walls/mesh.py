@@ -50,7 +50,8 @@ _CENTERINGS = 6
 _REJECTED = 1000.0
 """How bad a cell is that OpenFOAM rejects. A face is as bad as the square of its angle over `_OBLIQUE`, less 1."""
 _MANY, _SHARE = 250, 0.05
-"""So many rejected cells, and such a share of those at walls, are more than cures can mend in a time like the run's."""
+"""So many rejected cells, and such a share of those at walls, are more than cures can mend in a time like the run's:
+they stay as they are."""
 _GOLDEN = (5**0.5 - 1) / 2
 _SIMPLER, _SIMPLER_AFTER = 3, 2
 """How often walls of rejected cells become simpler, at first and after each move of generators."""
@@ -276,11 +277,12 @@ def solid_diagram(
     state = np.column_stack([points, np.full(len(points), EXACT)])
     first = remake(state, None)
     assert first is not None
-    mesh = least_bad(first, state, sizes, rejected, change, remake, goes_on)
+    spared = centers and _are_many(first.near, first.rejected)
+    mesh = first if spared else least_bad(first, state, sizes, rejected, change, remake, goes_on)
     state[:, :3], state[:, 3] = mesh.near.points, EXACT
     state[mesh.near.rows, 3] = mesh.walls[:-1]
     latest[:] = [mesh]
-    trials = [True] * _CENTERINGS if centers else []
+    trials = [True] * _CENTERINGS if centers and not spared else []
     centered = least_bad(mesh, state, sizes, oblique, center, remake, trials)
     mesh = min(centered, mesh, key=lambda made: len(made.rejected))
     tell("cells without walls")
@@ -298,7 +300,10 @@ def _warn_of(mesh: _Made, home: np.ndarray) -> None:
     `home` is that of all cells of the diagram; see `solid_diagram`.
     """
     near, points, rejected = mesh.near, mesh.near.points, mesh.faces.generators[mesh.rejected]
-    lost = np.setdiff1d(np.arange(len(points)), home)
+    lost, remedy = np.setdiff1d(np.arange(len(points)), home), ""
+    if _are_many(near, mesh.rejected):
+        wrap = np.median(near.sizes[mesh.home[mesh.rejected]]) / 1.5
+        remedy = f", or leave out details finer than cells, as Solid(..., wrap={wrap:.2g}) and Solid.read do"
     for rows, text in (
         (points[lost], "generators at {} have no cell: the solid is thinner than a cell, which is left out"),
         (points[-1 - home[home < 0]], "cells at {} are parts of others, cut where these were concave"),
@@ -310,7 +315,8 @@ def _warn_of(mesh: _Made, home: np.ndarray) -> None:
     ):
         if len(rows):
             place = format_point(rows[0]) + (" and elsewhere" if len(rows) > 1 else "")
-            warn(f"{len(rows)} {text.format(place)}; use smaller sizes there", MismatchWarning)
+            more = remedy if rows is rejected else ""
+            warn(f"{len(rows)} {text.format(place)}; use smaller sizes there{more}", MismatchWarning)
 
 
 def _check_lost(surface: WallSurface, near: NearWalls, home: np.ndarray) -> None:
@@ -324,24 +330,17 @@ def _check_lost(surface: WallSurface, near: NearWalls, home: np.ndarray) -> None
         )
 
 
-def _check_followed(surface: WallSurface, near: NearWalls, cells: np.ndarray) -> None:
-    """Raise an `InputError` if so many `cells` (k,) are rejected that cures of all would take long, and help few."""
-    if len(cells) > max(_MANY, _SHARE * len(near.rows)):
-        raise InputError(
-            f"{surface.solid} has details finer than cells in many places: {len(cells)} of {len(near.rows)} cells at "
-            f"walls are concave or inverted, the first at {format_point(near.generators[cells[0]])}, where h is "
-            f"{near.sizes[cells[0]]:.3g}; use smaller sizes there, or leave out such details: Solid(..., wrap="
-            f"{np.median(near.sizes[cells]) / 1.5:.2g}), as Solid.read has it, too"
-        )
+def _are_many(near: NearWalls, rejected: np.ndarray) -> bool:
+    """Return whether so many cells are `rejected` (k,) that cures of all would take long, and help few."""
+    return len(rejected) > max(_MANY, _SHARE * len(near.rows))
 
 
 def _finished(
-    surface: WallSurface, raw: _Made, earlier: Cures | None, tell: Callable[[str], object], checks: bool
+    surface: WallSurface, raw: _Made, earlier: Cures | None, tell: Callable[[str], object], spares: bool
 ) -> _Made:
     """Return `raw` cells near the surface without short edges and slivers, cured where OpenFOAM rejects them.
 
-    `earlier` cures are repeated in cells that both meshes share. With `checks`, an `InputError` is raised if too many
-    cells are rejected.
+    `earlier` cures are repeated in cells that both meshes share. With `spares`, none is made if they are many.
     """
     near, home, own, cures = raw.near, raw.home, raw.own, None
     tell("short edges at walls")
@@ -353,10 +352,8 @@ def _finished(
         suspect[rejected] = True
         faces, changed = _collapsed(faces, near.sizes[home], with_neighbors(faces, suspect))
         rejected = rejected_at_walls(faces, with_neighbors(faces, changed | suspect))
-    if len(rejected):
+    if len(rejected) and not (spares and _are_many(near, rejected)):
         tell("cells that are rejected at walls")
-        if checks:
-            _check_followed(surface, near, home[rejected])
         names, h = near.numbers[home], near.sizes[home]
         faces, origin, own, rejected, cures = cured(surface, faces, names, own, h, rejected, earlier)
         home = home[origin]

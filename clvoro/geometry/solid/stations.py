@@ -186,7 +186,7 @@ def _share_sectors(solid: Solid, chains: list[_Crease]) -> list[_Crease]:
     partner = dict(zip(i[rows].tolist(), j[rows].tolist(), strict=True))
     for k in rows.tolist():
         chain, row = item[i[k]]
-        if opposite[k] and partner[int(j[k])] == i[k]:
+        if opposite[k] and partner.get(int(j[k])) == i[k]:
             chain.share_common(row, float((gap[k] ** 2).sum() / width[k]), bool(facet[0, k] == 1))
         else:
             chain.share(row, 0.5 * (angle[i[k]] + angle[j[k]] - math.pi), bool(facet[0, k] == 1))

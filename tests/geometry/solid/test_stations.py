@@ -132,3 +132,12 @@ def test_given_generators_in_balls_are_reported():
 
 def test_solids_without_concave_creases_have_no_stations():
     assert len(Solid.box((0, 0, 0), (1, 1, 1)).stations(lambda x: np.full(len(x), 0.1))) == 0
+
+
+@pytest.mark.parametrize("slope", [(0, 0.3, -0.3), (0, 1, 0.7), (1.8, -3.1, 1)])
+def test_of_two_creases_beside_a_facet_one_may_have_larger_cells(slope):
+    """The facet is narrow for one of them only."""
+    plate = Solid.extruded(Polygon([(0, 0), (0.7, 0), (0.6, 0.07), (0.1, 0.18)]), 0, 0.5)
+    air = Solid.outside(plate, ((-1, -1, -1), (2, 2, 2)))
+    placed = air.stations(lambda x: 0.15 * np.exp(0.8 * np.sin(3 * x @ slope)))
+    assert (air.signed_distance(placed.points) < 0).all()
