@@ -183,13 +183,16 @@ def _share_sectors(solid: Solid, chains: list[_Crease]) -> list[_Crease]:
     good &= np.minimum(angle[i], angle[j]) > math.pi
     good[good] = np.abs(solid.signed_distance(middle[i[good]] + 0.5 * across[good])) < _ON_FACET * width[good]
     rows = np.flatnonzero(good)[np.lexsort((-width[good], opposite[good]))]  # the best last
-    partner = dict(zip(i[rows].tolist(), j[rows].tolist(), strict=True))
-    for k in rows.tolist():
-        chain, row = item[i[k]]
-        if opposite[k] and partner.get(int(j[k])) == i[k]:
-            chain.share_common(row, float((gap[k] ** 2).sum() / width[k]), bool(facet[0, k] == 1))
+    best = dict(zip(i[rows].tolist(), rows.tolist(), strict=True))
+    partner = {k: int(j[row]) for k, row in best.items()}
+    # Both sides of a facet have common generators only if all their chords are opposite to each other.
+    shifted = {item[k][0].number for k, row in best.items() if not opposite[row] or partner.get(partner[k]) != k}
+    for k, row in best.items():
+        chain, chord = item[k]
+        if not {chain.number, item[partner[k]][0].number} & shifted:
+            chain.share_common(chord, float((gap[row] ** 2).sum() / width[row]), bool(facet[0, row] == 1))
         else:
-            chain.share(row, 0.5 * (angle[i[k]] + angle[j[k]] - math.pi), bool(facet[0, k] == 1))
+            chain.share(chord, 0.5 * (angle[k] + angle[partner[k]] - math.pi), bool(facet[0, row] == 1))
     shared = {v for c in chains for v, end in zip(c.vertices.tolist(), (0, -1), strict=True) if c.shared[end]}
     return [c for c in chains if c.line.at[-1] > _NARROW * c.full[0] or not shared.issuperset(c.vertices.tolist())]
 
