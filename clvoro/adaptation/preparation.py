@@ -15,6 +15,7 @@ from ..geometry.domain import Domain
 from ..geometry.fixed_generators import FixedGenerators
 from ..geometry.gaps import NARROW
 from ..sizing import Sizing, as_field
+from ..sizing.estimates import LARGEST
 from ..sizing.field import on_domain
 from .diagnostics import check_precision, warn_of_narrow_parts
 from .estimates import SAMPLE, Extras, check_memory, check_prisms, expected_images, expected_surplus, holder_of_all
@@ -30,7 +31,7 @@ from .sampling.quadrature import DensityTree
 from .sampling.start import charted, density_tree, replace_far, sample_density, sample_uniform
 from .stages import Stages
 from .state import MeshState, Setup
-from .tuning import CELLS_ACROSS, GRADIENT_STEP, LARGE, LEAST_STEEP, MOVES, NEAR_SIZE, OPENINGS, SAMPLED_SIZES, STEPS
+from .tuning import CELLS_ACROSS, GRADIENT_STEP, LEAST_STEEP, MOVES, NEAR_SIZE, OPENINGS, SAMPLED_SIZES, STEPS
 
 _APART = 0.7
 """Least distance of generators around concave creases from those beside surfaces inside, over h."""
@@ -337,7 +338,7 @@ def _is_large(setup: Setup, coarseness: float) -> bool:
     """Return whether cells of size ``coarseness * h`` may leave a half of a sphere free."""
     largest = setup.domain.largest_size
     h = coarseness * setup.factor * setup.sizing(setup.domain.even_points(SAMPLED_SIZES)) if largest < math.inf else 0.0
-    return float(np.max(h)) > LARGE * largest
+    return float(np.max(h)) > LARGEST * largest
 
 
 def start(prepared: Prepared) -> MeshState:

@@ -21,8 +21,6 @@ SINGLE_LEVEL_ERROR_TARGET = 0.0017
 """Largest error target with one level."""
 SAMPLED_SIZES = 2000
 """Places at which sizes are compared with the largest one of the domain."""
-LARGE = 0.8
-"""Largest size on coarser levels over the largest one of the domain."""
 STEPS = 100
 """Default number of steps of a method that repeats one kind of step."""
 WINDOW = 10

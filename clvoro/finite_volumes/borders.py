@@ -16,7 +16,7 @@ from ..mesh.diagram import Diagram
 from ..mesh.faces import Faces
 from ..mesh.geometry import sum_rows
 from .collapse import collapse_short
-from .moves import FEW, MOVES, least_bad, moved
+from .moves import FEW, MOVES, at_generators, least_bad, moved
 from .solid_walls.mend import NARROW, cells_of, narrow_faces, rejected_among, with_neighbors
 from .solid_walls.mesh import diagram_of
 
@@ -100,8 +100,7 @@ def on_surfaces(
         return moved(domain, depth, sizes, points, rows, move, held) if len(rows) <= FEW * len(points) else points
 
     def badness(made: _OnSurfaces) -> np.ndarray:
-        n = len(points) + 1
-        return np.bincount(made.home[made.rejected] % n, minlength=n).astype(float)
+        return at_generators(made.home[made.rejected], len(points))
 
     return least_bad(first, points, sizes, badness, change, again, [False] * MOVES).diagram
 

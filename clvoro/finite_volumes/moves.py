@@ -22,7 +22,7 @@ _STEPS, _BESIDE = (0.1, 0.15, 0.2, 0.25, 0.3), 1.3
 _GROUP = 2.5
 """Distance over h up to which rejected cells are in one group."""
 _RETURNS = 4
-"""Largest number of meshes in which groups are changed back."""
+"""How often groups are changed back and a mesh is made again, at most."""
 _DEEP = 0.1
 """Least distance of moved generators from the boundary of the domain, over h."""
 _NEAR, _MIRRORED = 0.75, 0.2
@@ -103,6 +103,14 @@ def least_bad(
         state = state.copy()
         state[changed] = begun[changed]
     return best
+
+
+def at_generators(rows: np.ndarray, n: int, weights: np.ndarray | None = None) -> np.ndarray:
+    """Return how often each of n generators is in `rows` (k,), -1 for none, or the sums of `weights`: (n + 1,) float.
+
+    The last number is that of -1.
+    """
+    return np.bincount(rows % (n + 1), weights, n + 1).astype(float)
 
 
 def _compared(

@@ -173,10 +173,10 @@ class PlacedLayers:
     points: np.ndarray
     """(n, d) float. Generators of layers, which do not move. Layers of prisms have none."""
     free: Domain
-    """Where other generators move."""
+    """The part of the domain beyond the layers, in which all other generators move."""
     layers: Sequence[Layers] = ()
     compress = False
-    """Whether they compress other cells, after a run."""
+    """Whether the layers are made after a run, and other cells give up the room that they take."""
 
     def __init__(self, domain: Domain) -> None:
         self.free, self.points = domain, np.empty((0, domain.dim))

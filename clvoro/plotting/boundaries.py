@@ -13,7 +13,7 @@ from ..errors import InputError, InputTypeError
 from ..geometry.domain import Domain
 from ..io.convert import missing
 from .cells import frame_part
-from .solids import VIEW, brightness, view_axes
+from .solids import VIEW, brightness, fills_box, view_axes
 from .style import METHOD_COLORS, WIDTH, frame_domain, interactive_figure, single_height, styled
 
 if TYPE_CHECKING:
@@ -22,8 +22,6 @@ if TYPE_CHECKING:
 
 _DASHES = ("-", "--", ":", "-.")  # for more names than colors
 _PARTS = 64  # Pieces of triangles are smaller than this part of the domain's longest edge.
-_ON_BOX = 1e-6  # of the longest edge: walls so near to a side of the bounding box lie on it
-_CLOSED = 0.5  # Pictures look into a domain whose walls cover more than this share of the sides of its bounding box.
 _HUES = np.array([to_rgb(color) for color in METHOD_COLORS])
 _LABEL: Any = {
     "ha": "center",
@@ -102,10 +100,7 @@ def _plot_in_space(domain: Domain, numbers: bool) -> Any:
     normals = np.cross(pieces[:, 1] - pieces[:, 0], pieces[:, 2] - pieces[:, 0])
     areas = np.linalg.norm(normals, axis=1) / 2
     normals /= np.maximum(2 * areas, 1e-300)[:, None]
-    gaps = np.abs(pieces[..., None, :] - np.array([domain.lower, domain.upper])).max(axis=1)
-    a, b, c = domain.extent
-    on_box = (gaps < _ON_BOX * domain.extent.max()).any(axis=(1, 2))
-    outwards = -1 if areas[on_box].sum() > 2 * _CLOSED * (a * b + b * c + c * a) else 1
+    outwards = -1 if fills_box(domain, pieces, areas) else 1
     hues = (wall if numbers else domain.boundary_index[wall]) % len(METHOD_COLORS)
     figure = interactive_figure(WIDTH, WIDTH / 2)
     hidden = set(walls.tolist())

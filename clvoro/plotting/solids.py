@@ -8,7 +8,7 @@ drawn in that order, each covers those behind it.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -41,7 +41,7 @@ _VTK_POLYHEDRON = 42
 _IN_CUT = 0.7
 """Brightness of faces in the cut, over that of faces on walls and sides of the box."""
 _IN_BOX, _NAMES = 0.5, 10
-"""Share of the sides of its bounding box that are walls of the space around a body; boundaries of it that are named."""
+"""Least share of the sides of its bounding box that are walls of a space in a box; names of boundaries in a picture."""
 
 
 def plot_slice(
@@ -432,7 +432,7 @@ def _walls_of(diagram: Diagram, polygons: list[np.ndarray]) -> np.ndarray:
     return np.where(np.asarray(far) < 1e-6 * diagram.domain.extent.max(), walls[row], -1)
 
 
-def _on_sides(domain: Domain, polygons: list[np.ndarray]) -> np.ndarray:
+def _on_sides(domain: Domain, polygons: Sequence[np.ndarray]) -> np.ndarray:
     """Return which polygons lie on a side of the box, (f,) bool."""
     starts = np.cumsum([0, *map(len, polygons)])[:-1]
     gaps = np.stack([np.concatenate(polygons) - side for side in (domain.lower, domain.upper)], axis=1)
@@ -444,9 +444,14 @@ def around_body(diagram: Diagram) -> bool:
     """Return whether the domain is the space around a body: walls on most sides of its bounding box, and others."""
     if not diagram.domain.curved_walls:
         return False
-    faces, (x, y, z) = diagram.faces, diagram.domain.extent
-    body = _is_body(diagram, _wall_polygons(faces))
-    return bool(body.any()) and faces.area[faces.n_inner :][~body].sum() > _IN_BOX * 2 * (x * y + y * z + z * x)
+    polygons, areas = _wall_polygons(diagram.faces), diagram.faces.area[diagram.faces.n_inner :]
+    return bool(_is_body(diagram, polygons).any()) and fills_box(diagram.domain, polygons, areas)
+
+
+def fills_box(domain: Domain, polygons: Sequence[np.ndarray], areas: np.ndarray) -> bool:
+    """Return whether walls, given as `polygons` with their `areas` (f,), are most of the sides of the bounding box."""
+    x, y, z = domain.extent
+    return bool(areas[_on_sides(domain, polygons)].sum() > 2 * _IN_BOX * (x * y + y * z + z * x))
 
 
 def _wall_polygons(faces: Faces) -> list[np.ndarray]:
@@ -489,10 +494,8 @@ def _draw_cutaway(
     screen = np.stack([right, up], axis=1)
     cut = _cut(cut, len(diagram), towards)
     body = _body_faces(diagram, cut, through, towards)
-    cells, polygons, normals = (
-        np.concatenate(parts) if isinstance(parts[0], np.ndarray) else [*parts[0], *parts[1]]
-        for parts in zip(visible_faces(diagram, cut, through, towards), body, strict=True)
-    )
+    cells, polygons, normals = visible_faces(diagram, cut, through, towards)
+    cells, polygons, normals = np.append(cells, body[0]), polygons + body[1], np.concatenate([normals, body[2]])
     flat = [polygon @ screen for polygon in polygons]
     corners = np.stack(np.meshgrid(*np.transpose([diagram.domain.lower, diagram.domain.upper])), axis=-1).reshape(-1, 3)
     pairs = [(a, b) for i, a in enumerate(corners) for b in corners[i + 1 :] if np.count_nonzero(a != b) == 1]

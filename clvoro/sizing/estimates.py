@@ -23,7 +23,8 @@ if TYPE_CHECKING:
     from ..mesh.results import Result
 
 LARGEST = 0.8
-"""Largest size of an estimate over that of a run, which scales the sizes to a number of cells."""
+"""Largest size of an estimate, and of cells on a coarse level, over the largest one that a domain allows: a run may
+still make all sizes a little larger to meet a number of cells."""
 SMOOTHED = 2
 """Number of passes that smooth sizes from second derivatives. These are noisy, and change their sign in a layer."""
 

@@ -109,7 +109,7 @@ class Polyhedra(CellBuilder):
         return {}
 
     def order_rows(self, part: Part, t: Tessellation) -> None:
-        """Sort the rows of `t` by the labels of `part`, those of cells with many faces in global memory."""
+        """Sort the faces of each cell of `t` by the labels of `part`; those of cells with many in global memory."""
         super().order_rows(part, t)
         if self._has_many:
             engine, space = self.engine, {"CELL_BYTES": cell_bytes(MOST_NUMBERED, self.engine.real)}

@@ -15,7 +15,7 @@ from ...mesh.connectivity import distinct, following, take_ranges, take_rows
 from ...mesh.diagram import Diagram
 from ...mesh.faces import Faces
 from ..collapse import collapse_short
-from ..moves import FEW, MOVES, least_bad, moved
+from ..moves import FEW, MOVES, at_generators, least_bad, moved
 from .chains import Crossings, cross_cells
 from .cures import Cures, cured
 from .mend import at_wall, changed_cells, narrow_faces, rejected_at_walls, touching_walls, with_neighbors
@@ -94,6 +94,19 @@ class _Made:
     own: np.ndarray
     rejected: np.ndarray
     cures: Cures | None = None
+
+    def count_rejected(self) -> np.ndarray:
+        """Return the number of rejected cells of each generator, and of cells without one, (n + 1,) float."""
+        return at_generators(self.near.numbers[self.home[self.rejected]], len(self.near.points))
+
+    def weigh_oblique(self) -> np.ndarray:
+        """Return how bad the cells of each generator are, those with oblique faces, too, (n + 1,) float."""
+        inner = slice(self.faces.n_inner)
+        pairs = self.near.numbers[self.home][np.stack([self.faces.owner[inner], self.faces.neighbor[inner]])]
+        excess = np.maximum(self.faces.measures.non_orthogonality[inner] / _OBLIQUE - 1, 0) ** 2
+        excess[(pairs < 0).any(axis=0)] = 0
+        oblique = at_generators(pairs.ravel(), len(self.near.points), np.tile(excess, 2))
+        return _REJECTED * self.count_rejected() + oblique
 
 
 def outer_generators(surface: WallSurface, points: np.ndarray, sizes: np.ndarray) -> np.ndarray:
@@ -216,11 +229,11 @@ def solid_diagram(
             tell(f"walls of {len(near.rows)} cells")
             raw = _Maker(surface, near, np.append(state[near.rows, 3], EXACT)).mesh()
             _check_lost(surface, near, raw.home)
-            made = _finished(surface, raw, None if last is None else last.cures, tell, centers and last is None)
         except InputError:  # a simpler cell of a thin part may be nothing
             if last is None:
                 raise
             return None
+        made = _finished(surface, raw, None if last is None else last.cures, tell, centers and last is None)
         latest[:] = [made]
         return made
 
@@ -249,18 +262,6 @@ def solid_diagram(
     def depth(x: np.ndarray) -> np.ndarray:
         return -surface.closest(x)[2]
 
-    def rejected(made: _Made) -> np.ndarray:
-        n = len(sizes) + 1
-        return np.bincount(made.near.numbers[made.home[made.rejected]] % n, minlength=n).astype(float)
-
-    def oblique(made: _Made) -> np.ndarray:
-        inner = slice(made.faces.n_inner)
-        pairs = made.near.numbers[made.home][np.stack([made.faces.owner[inner], made.faces.neighbor[inner]])]
-        excess = np.maximum(made.faces.measures.non_orthogonality[inner] / _OBLIQUE - 1, 0) ** 2
-        excess[(pairs < 0).any(axis=0)] = 0
-        n = len(sizes) + 1
-        return _REJECTED * rejected(made) + np.bincount(pairs.ravel() % n, np.tile(excess, 2), n)
-
     def center(state: np.ndarray, rows: np.ndarray, number: int) -> np.ndarray:
         del number
         made, trial = latest[0], state.copy()
@@ -278,12 +279,12 @@ def solid_diagram(
     first = remake(state, None)
     assert first is not None
     spared = centers and _are_many(first.near, first.rejected)
-    mesh = first if spared else least_bad(first, state, sizes, rejected, change, remake, goes_on)
+    mesh = first if spared else least_bad(first, state, sizes, _Made.count_rejected, change, remake, goes_on)
     state[:, :3], state[:, 3] = mesh.near.points, EXACT
     state[mesh.near.rows, 3] = mesh.walls[:-1]
     latest[:] = [mesh]
     trials = [True] * _CENTERINGS if centers and not spared else []
-    centered = least_bad(mesh, state, sizes, oblique, center, remake, trials)
+    centered = least_bad(mesh, state, sizes, _Made.weigh_oblique, center, remake, trials)
     mesh = min(centered, mesh, key=lambda made: len(made.rejected))
     tell("cells without walls")
     faces, home = mesh.near.put_back(mesh.faces, mesh.home, mesh.own)

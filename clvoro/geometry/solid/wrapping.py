@@ -20,13 +20,13 @@ from ..surface import Surface
 from .combining import library
 
 _OFF = 0.5
-"""Distance of the wrap from the triangles, over its reach."""
+"""Distance of the closed surface from the triangles, over `reach`."""
 _STEP, _EDGE = 3, 1.5
 """Grid points per reach; length of edges of the wrap in steps of the grid."""
 _SIMPLER = 0.1
 """How far triangles may move to be fewer, in steps of the grid."""
 _BLOCK = 8
-"""Grid points along the edge of a block."""
+"""Distances are computed in cubic blocks of the grid near the triangles: grid points along the edge of one."""
 _MOST = 50_000_000
 """Most points of a grid."""
 
@@ -74,7 +74,7 @@ class _Sampled:
         self.low, self.step, self.shape = low, step, shape
 
     def distance(self, surface: Surface, reach: float, where: np.ndarray | None = None) -> np.ndarray:
-        """Return the distance of each point from a surface, up to `reach`, and `reach` where it is not computed."""
+        """Return the distance of each grid point from a surface; farther ones, and those not `where`, have `reach`."""
         blocks = np.stack(np.meshgrid(*(np.arange(0, n, _BLOCK) for n in self.shape), indexing="ij"), -1).reshape(-1, 3)
         begin = self.low + self.step * blocks
         met = np.unique(surface.tree.meeting(begin - reach, begin + _BLOCK * self.step + reach)[0])
@@ -88,7 +88,10 @@ class _Sampled:
         return found
 
     def level(self, name: str, values: np.ndarray) -> Surface:
-        """Return the surface where `values` on the grid are 0, around those above."""
+        """Return the surface where `values` on the grid are 0, around those above.
+
+        The library asks for one place after the other: first for all places, whose values are computed together.
+        """
         low, high = self.low + 0.5 * self.step, self.low + (np.array(self.shape) - 1.5) * self.step
         bounds = [*low.tolist(), *high.tolist()]
         places: list[tuple[float, float, float]] = []
@@ -100,8 +103,8 @@ class _Sampled:
         manifold = library().Manifold
         manifold.level_set(note, bounds, _EDGE * self.step)
         x = (np.array(places) - self.low) / self.step
-        found = iter(scipy.ndimage.map_coordinates(values, x.T, order=1).tolist())
-        mesh = manifold.level_set(lambda *_: next(found), bounds, _EDGE * self.step)
+        found = dict(zip(places, scipy.ndimage.map_coordinates(values, x.T, order=1).tolist(), strict=True))
+        mesh = manifold.level_set(lambda *x: found[x], bounds, _EDGE * self.step)
         mesh = mesh.simplify(_SIMPLER * self.step).to_mesh64()
         return Surface(np.array(mesh.vert_properties)[:, :3], np.array(mesh.tri_verts, np.int64), name)
 
