@@ -19,8 +19,10 @@ from functools import cache
 from pathlib import Path
 
 import pyopencl as cl
+from pyopencl.characterize import has_src_build_cache
 
 from ..errors import BuildError
+from .runtimes import remove_dead_locks
 
 _INCLUDE = re.compile(r'^\s*#include\s+"([^"]+)"\s*$')
 _lock = threading.Lock()
@@ -176,7 +178,10 @@ def compile_text(ctx: cl.Context, text: str, options: tuple[str, ...], short: bo
 
 
 def _build(ctx: cl.Context, text: str, options: tuple[str, ...]) -> cl.Program:
-    return cl.Program(ctx, text).build(options=list(options))
+    program = cl.Program(ctx, text)
+    if not has_src_build_cache(ctx.devices[0]):
+        remove_dead_locks()
+    return program.build(options=list(options))
 
 
 def text_for_driver(

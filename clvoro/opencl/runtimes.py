@@ -24,11 +24,14 @@ import hashlib
 import os
 import sys
 import tempfile
+import time
 from importlib import metadata
 from pathlib import Path
 
 _ROOM = 1 << 22
 """Bytes that must be free in the cache. The kernels of a run take 2 to 20 MB."""
+_HELD = 5.0
+"""Seconds after which a lock of PyOpenCL's cache is that of a dead process. Others hold it for milliseconds."""
 _DISTRIBUTION = "intel-opencl-rt"
 _LIBRARY = "libintelocl.so"
 _NVIDIA_LIBRARY = "libnvidia-opencl.so.1"
@@ -90,10 +93,24 @@ def cache_remedy() -> str:
         home = Path("~/.cache")
     pocl = os.environ.get("POCL_CACHE_DIR") or home / "pocl"
     return (
-        "If kernels in a cache are damaged (after a power cut, say), or a process that was killed has left the file "
-        f"`lock` in it (others then fail after a minute), remove {pocl}, {home / 'pyopencl'} and {home / 'pytools'}; "
+        f"If kernels in a cache are damaged (after a power cut, say), remove {pocl}, {home / 'pyopencl'} and "
+        f"{home / 'pytools'}; "
         "if its disk is full or not writable, set XDG_CACHE_HOME to another folder"
     )
+
+
+def remove_dead_locks() -> None:
+    """Remove the lock of PyOpenCL's cache that a process has left which was killed while it read or wrote the cache.
+
+    With such a lock PyOpenCL waits for a minute, and fails.
+    """
+    with contextlib.suppress(OSError, RuntimeError):  # a lock is gone, or the user has no home
+        for lock in cache_home().glob("pyopencl/*/lock"):
+            made, began = lock.stat().st_mtime_ns, time.monotonic()
+            while lock.stat().st_mtime_ns == made:
+                if time.monotonic() - began > _HELD:
+                    lock.unlink()
+                time.sleep(0.01)
 
 
 def cache_home() -> Path:

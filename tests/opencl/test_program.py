@@ -11,7 +11,7 @@ import pyopencl.array as cla
 import pytest
 
 import clvoro
-from clvoro.opencl import program
+from clvoro.opencl import program, runtimes
 from clvoro.opencl.engine import Engine
 from clvoro.opencl.program import source_text
 from clvoro.sizing.expression import _FUNCTIONS
@@ -52,6 +52,22 @@ def test_pocl_reads_short_declarations(ctx, monkeypatch):
     assert [text.endswith(ours) or text.endswith(other) for text in texts] == [True] * 4
     whole = [program.NO_ABI_WARNINGS + text for text in (ours, other)]
     assert [text in whole for text in texts] == [False, True, False, True]
+
+
+@pytest.mark.slow
+def test_lock_of_a_killed_process_is_removed(ctx, tmp_path, monkeypatch):
+    """PyOpenCL keeps binaries of devices that keep none. A process that is killed meanwhile leaves its lock."""
+    monkeypatch.setattr("pyopencl.characterize.has_src_build_cache", lambda device: False)
+    monkeypatch.setattr(program, "has_src_build_cache", lambda device: False)
+    monkeypatch.setattr(runtimes, "_HELD", 0.1)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    source = "kernel void put(global double *x) { x[0] = x[1]; }"
+    program.compile_text(ctx, source, ())
+    (folder,) = tmp_path.glob("pyopencl/*")
+    lock = folder / "lock"
+    lock.touch()
+    program.compile_text(ctx, source, ())  # PyOpenCL by itself waits for a minute, and fails
+    assert not lock.exists()
 
 
 @pytest.mark.slow
