@@ -96,15 +96,13 @@ class Cells(CellBuilder):
         spare, whole = spare_slots(n), False
         while True:
             with engine.workspace.frame():
-                taken = self.take_rows(n, spare=spare, whole=whole)
-                flags, m = self._clip(taken, part, binned, exact)
+                taken = self.take_rows(n, part.box, part.points, exact, spare=spare, whole=whole)
+                flags, m = self._clip(taken, part, binned)
                 if flags & CROWDED:
                     # Repeat with twice the slots that were requested so far.
                     spare = 2 * (int(taken.report.get()[SPARE]) - n)
                     continue
-                t = None
-                if not flags & ~DOUBT:
-                    t = self.measure(taken, part.box, part.points, m, flags, exact)
+                t = None if flags & ~DOUBT else self.measure(taken, m, flags)
                 if t is not None:
                     if part.halo_args:
                         self._request_depths(part, binned, t)
@@ -131,9 +129,9 @@ class Cells(CellBuilder):
             *part.halo_args,
         )
 
-    def _clip(self, rows: FaceRows, part: Part, binned: BinnedPoints, exact: bool) -> tuple[int, int]:
+    def _clip(self, rows: FaceRows, part: Part, binned: BinnedPoints) -> tuple[int, int]:
         """Build and match the faces of the first ``rows.n`` cells of `part`, and return what `_match` returns."""
-        engine, corners, n, total = self.engine, part.box.device_corners(self.engine.real), rows.n, part.count
+        engine, n, total = self.engine, rows.n, part.count
         hulls = self._hulls if n >= LANES_FROM[2] else None
         some = hulls is not None
         bounds = () if self._bounds is None else self._bounds.build(part.box, part.points, total)
@@ -147,7 +145,7 @@ class Cells(CellBuilder):
                 binned.items,
                 binned.spacing,
                 *binned.search,
-                *corners,
+                *rows.corners,
                 engine.real.type(FIRST_REACH),
                 rows.slots,
                 rows.counts,
@@ -162,8 +160,8 @@ class Cells(CellBuilder):
                 binned.points,
                 binned.items,
                 *binned.search,
-                part.points,
-                *corners,
+                rows.points,
+                *rows.corners,
                 np.int32(some),
                 rows.slots,
                 rows.counts,
@@ -171,7 +169,7 @@ class Cells(CellBuilder):
                 rows.report,
                 *bounds,
             )
-            found = self._match(rows, part.box, part.points, exact)
+            found = self._match(rows)
             if not found[0] & FULL or found[0] & CROWDED:
                 return found
             self._enlarge(n)
@@ -189,12 +187,12 @@ class Cells(CellBuilder):
         is open in a folded graph.
         """
         n = previous.n
-        rows = self.take_rows(n, spare=spare_slots(n))
+        rows = self.take_rows(n, box, points, exact, spare=spare_slots(n))
         self.engine.run_each(
             self._kernels.clip_by_rings,
             n,
             points,
-            *box.device_corners(self.engine.real),
+            *rows.corners,
             previous.starts,
             previous.neighbors,
             rows.slots,
@@ -202,10 +200,8 @@ class Cells(CellBuilder):
             rows.places,
             rows.report,
         )
-        flags, m = self._match(rows, box, points, exact)
-        if flags & ~DOUBT:
-            return None
-        return self.measure(rows, box, points, m, flags, exact)
+        flags, m = self._match(rows)
+        return None if flags & ~DOUBT else self.measure(rows, m, flags)
 
     def measure_faces(self, box: ClipBox, t: Tessellation) -> Tessellation:
         """Return `t`, a diagram of `box`, with face measures and centroids in full precision, in new arrays."""
@@ -229,20 +225,12 @@ class Cells(CellBuilder):
         """Return the flags and the number of half-faces. `CROWDED`: there were too few spare slots."""
         return verdict(self._report.get().tolist())
 
-    def _match(self, rows: FaceRows, box: ClipBox, points: cla.Array, exact: bool) -> tuple[int, int]:
+    def _match(self, rows: FaceRows) -> tuple[int, int]:
         """Make the rows symmetric; return the flags and the number of half-faces."""
-        self.enqueue_match(rows, box, points, exact)
+        self.enqueue_match(rows)
         return self._read_report()
 
-    def enqueue_match(
-        self,
-        rows: FaceRows,
-        box: ClipBox,
-        points: cla.Array,
-        exact: bool,
-        marks: cla.Array | None = None,
-        fits: cla.Array | None = None,
-    ) -> None:
+    def enqueue_match(self, rows: FaceRows, marks: cla.Array | None = None, fits: cla.Array | None = None) -> None:
         """Make the rows symmetric, and count their faces.
 
         In an update nothing is done while cells are marked, by `marks` (n,). `fits` (n,) is 1 for a row if every
@@ -257,10 +245,10 @@ class Cells(CellBuilder):
             rows.slots,
             rows.counts,
             *rows.old,
-            points,
-            *box.device_corners(engine.real),
+            rows.points,
+            *rows.corners,
             int(fits is not None),
-            self._share(exact),
+            rows.share,
             rows.places if marks is None else marks,
             rows.places if fits is None else fits,
             rows.keep,
@@ -273,9 +261,7 @@ class Cells(CellBuilder):
         """Set `rows.starts` and the number of half-faces from the lengths of rows."""
         self._scan.exclusive(counts, rows.starts, rows.n, total=(rows.report, KEPT))
 
-    def measure(
-        self, rows: FaceRows, box: ClipBox, points: cla.Array, m: int, flags: int, exact: bool, ahead: bool = False
-    ) -> Tessellation | None:
+    def measure(self, rows: FaceRows, m: int, flags: int, ahead: bool = False) -> Tessellation | None:
         """Write graph and measures of the rows; return None if doubtful cells are inconsistent.
 
         With `ahead` the report is not known. Nothing is written unless its flags are 0 and there are at most `m` faces.
@@ -286,21 +272,19 @@ class Cells(CellBuilder):
         direct = rows.all_new and not flags & DOUBT
         neighbors = faces["neighbors"] if direct else engine.scratch(m, np.int32)
         unless = int(ahead), m, rows.report
-        self._measure_rows(rows, box, points, unless, neighbors)
+        self._measure_rows(rows, unless, neighbors)
         if flags & DOUBT:
-            wrong = self._check_doubtful(rows, box, points, neighbors, exact)
+            wrong = self._check_doubtful(rows, neighbors)
             if wrong & LOOPED and rows.all_new:
-                return self._measure_without_loops(rows, box, points, neighbors, exact)
+                return self._measure_without_loops(rows, neighbors)
             if wrong:
                 return None
         copy = int(not direct), *unless, rows.starts, neighbors, new["starts"], faces["neighbors"]
         engine.run_blocks(self._kernels.copy_graph, n, *copy)
         arrays: dict[str, Any] = {**new, **faces}
-        return Tessellation(n, points, **arrays)
+        return Tessellation(n, rows.points, **arrays)
 
-    def _measure_rows(
-        self, rows: FaceRows, box: ClipBox, points: cla.Array, unless: tuple[object, ...], neighbors: cla.Array
-    ) -> None:
+    def _measure_rows(self, rows: FaceRows, unless: tuple[object, ...], neighbors: cla.Array) -> None:
         """Write the graph of the rows to `neighbors`, and their measures, `unless` as `measure` says."""
         new, faces = self.cells_of(rows.n), self._faces
         self.engine.run(
@@ -313,8 +297,8 @@ class Cells(CellBuilder):
             *rows.old,
             rows.keep,
             rows.starts,
-            points,
-            *box.device_corners(self.engine.real),
+            rows.points,
+            *rows.corners,
             *unless,
             neighbors,
             faces["face_measures"],
@@ -324,9 +308,7 @@ class Cells(CellBuilder):
             new["covariances"],
         )
 
-    def _check_doubtful(
-        self, rows: FaceRows, box: ClipBox, points: cla.Array, neighbors: cla.Array, exact: bool
-    ) -> int:
+    def _check_doubtful(self, rows: FaceRows, neighbors: cla.Array) -> int:
         """Return the error bits of doubtful cells in the graph (`rows.starts`, `neighbors`)."""
         self.engine.run_each(
             self._kernels.check_doubtful,
@@ -336,16 +318,14 @@ class Cells(CellBuilder):
             rows.starts,
             neighbors,
             self.cells_of(rows.n)["volumes"],
-            points,
-            *box.device_corners(self.engine.real),
-            self._share(exact),
+            rows.points,
+            *rows.corners,
+            rows.share,
             rows.report,
         )
         return self._read_report()[0] & ~DOUBT
 
-    def _measure_without_loops(
-        self, rows: FaceRows, box: ClipBox, points: cla.Array, neighbors: cla.Array, exact: bool
-    ) -> Tessellation | None:
+    def _measure_without_loops(self, rows: FaceRows, neighbors: cla.Array) -> Tessellation | None:
         """Measure again without the crossing faces of the graph (`rows.starts`, `neighbors`)."""
         n, drop_loops = rows.n, self._kernels.drop_loops
         counts = self.engine.scratch(n + 1, np.int32)
@@ -354,26 +334,24 @@ class Cells(CellBuilder):
         self.engine.run_each(drop_loops, n, rows.places, rows.counts, *graph, rows.keep, counts, rows.report)
         self._count(rows, counts)
         flags, m = self._read_report()
-        if flags & ~DOUBT:
-            return None
-        return self.measure(rows, box, points, m, flags, exact)
-
-    def _share(self, exact: bool) -> np.floating:
-        return self.engine.real.type(EXACT_SHARE if exact else ROUGH_SHARE)
+        return None if flags & ~DOUBT else self.measure(rows, m, flags)
 
     def take_rows(
         self,
         n: int,
+        box: ClipBox,
+        points: cla.Array,
+        exact: bool,
         slots: int | None = None,
         spare: int = 0,
         whole: bool = False,
         reset: bool = True,
         previous: Tessellation | None = None,
     ) -> FaceRows:
-        """Return `n` empty rows of faces, of which `slots` (by default all) may be new; `reset` the report.
+        """Return `n` empty rows for the diagram of `points` in `box`, of which `slots` (by default all) may be new.
 
         Others are those of `previous`. `spare` slots follow, for rows longer than one slot. With `whole`, faces no
-        longer than round-off stay.
+        longer than round-off stay. `reset` the report. For `exact` see `tessellate`.
         """
         engine, slots = self.engine, n if slots is None else slots
         first, slots = slots, slots + spare
@@ -387,7 +365,9 @@ class Cells(CellBuilder):
         faces, counts = engine.scratch(slots * SLOT, np.int32), engine.scratch(slots, np.int32)
         keep, places = engine.scratch(slots, np.uint32), engine.scratch(n, np.int32)
         old = (places, places) if previous is None else (previous.starts, previous.neighbors)
-        return FaceRows(faces, counts, keep, places, engine.scratch(n + 1, np.int32), self._report, old)
+        share = engine.real.type(EXACT_SHARE if exact else ROUGH_SHARE)
+        starts, corners = engine.scratch(n + 1, np.int32), box.device_corners(engine.real)
+        return FaceRows(faces, counts, keep, places, starts, self._report, old, points, corners, share)
 
     def _reset_report(self, first: int, slots: int, whole: bool) -> None:
         """Reset the report; `first` and `slots` are the range of the spare slots."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
 import pyopencl.array as cla
 
 SLOT = 20
@@ -34,6 +35,12 @@ class FaceRows:
     old: tuple[cla.Array, cla.Array]
     """tuple of (n + 1,) int32 and int32. Starts and neighbors of the previous graph; `places` twice if all rows are
     new."""
+    points: cla.Array
+    """Generators, with weights in a power diagram."""
+    corners: tuple[object, ...]
+    """Lower and upper corner of the box, as arguments of kernels."""
+    share: np.floating
+    """Share of a cell that round-off may make uncertain."""
 
     @property
     def n(self) -> int:

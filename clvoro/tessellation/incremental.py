@@ -87,13 +87,12 @@ class IncrementalUpdate:
             self._fits.fill(0)
         first_most, most = int(MAX_SHARE * n), int((MAX_SHARE + AGAIN_SHARE) * n)
         spare = spare_slots(n)
-        rows = cells.take_rows(n, most, spare, reset=False, previous=previous)
+        rows = cells.take_rows(n, box, points, False, most, spare, reset=False, previous=previous)
         marks, listed = engine.scratch(n, np.int32), engine.scratch(most, np.int32)
         sums = engine.scratch(n + 1, np.int32)
-        corners = box.device_corners(engine.real)
         most_wrong = int(WRONG_SHARE * n / SAMPLE) if n >= SAMPLED_FROM else n
         engine.run_each(k.begin_update, n, marks, rows.places, rows.report, SIZE, most, most + spare)
-        given = *rows.old, points, *corners
+        given = *rows.old, points, *rows.corners
         check = most_wrong, *given, self._fits, marks, rows.report
         self._check(k.check_rows, -(-n // cells.lanes), n, check)
         done, expected = 0, [first_most] if self._expected is None else self._expected
@@ -104,8 +103,8 @@ class IncrementalUpdate:
                 self._scan.exclusive(marks, sums, n)
                 engine.run_each(k.list_marked, n, number, *limits, marks, sums, listed, rows.report)
                 self._clip_listed(k, cells, number, size, listed, rows, marks, given)
-            cells.enqueue_match(rows, box, points, exact=False, marks=marks, fits=self._fits)
-            t = cells.measure(rows, box, points, most_faces(n), 0, exact=False, ahead=True)
+            cells.enqueue_match(rows, marks, self._fits)
+            t = cells.measure(rows, most_faces(n), 0, ahead=True)
             assert t is not None
             found = follow(t, rows.report)
             sums_of_rounds = found[LISTED : LISTED + done + len(expected) + 1]
@@ -117,7 +116,7 @@ class IncrementalUpdate:
                 if flags & ~DOUBT:
                     return None
                 if flags or m > most_faces(n):
-                    t = cells.measure(rows, box, points, m, flags, exact=False)
+                    t = cells.measure(rows, m, flags)
                     if t is not None:
                         follow(t, None)
                 return t

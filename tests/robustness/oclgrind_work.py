@@ -201,7 +201,7 @@ def drop_loops(adapter: clvoro.Adapter) -> None:
             join(right, above, opposite, i)
         else:
             expected[i], expected[opposite] = list(rows[i]), list(rows[opposite])
-    made = stages.cells.take_rows(n)
+    made = stages.cells.take_rows(n, square, x, exact=True)
     slots = np.zeros((n, SLOT), np.int32)
     for i, labels in enumerate(rows):
         slots[i, : len(labels)] = labels
@@ -212,7 +212,7 @@ def drop_loops(adapter: clvoro.Adapter) -> None:
     made.keep.set((1 << counts.astype(np.uint32)) - 1)
     made.starts.set(np.concatenate([[0], np.cumsum(counts)]).astype(np.int32))
     graph = engine.upload(np.concatenate(rows), np.int32)
-    t = stages.cells._measure_without_loops(made, square, x, graph, exact=True)
+    t = stages.cells._measure_without_loops(made, graph)
     assert t is not None
     starts, neighbors = t.starts.get(), t.neighbors.get()
     assert [list(neighbors[a:b]) for a, b in pairwise(starts)] == expected

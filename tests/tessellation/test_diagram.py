@@ -206,7 +206,7 @@ def test_later_meshes_do_not_keep_an_enlarged_capacity(adapter64):
     tessellate(POINTS["graded"])
     assert cells.row_capacity == ROW_CAPACITY
     with pytest.raises(clvoro.ClvoroError, match="32-bit"):
-        cells.take_rows(2**31 // SLOT + 1)
+        cells.take_rows(2**31 // SLOT + 1, BOX, None, exact=True)
 
 
 @settings(max_examples=60, deadline=None)
@@ -244,7 +244,7 @@ def test_cells_with_two_faces_are_rejected(ctx, doubtful):
     cells, points = Cells(engine), engine.upload([[0.2, 0.2], [0.5, 0.3], [0.4, 0.6]])
     for two in (True, False):
         lists = [[1, 2] if two else [1, 2, -1], [0, -3, 2], [0, 1, -4]]
-        rows, n = cells.take_rows(3), len(lists)
+        rows, n = cells.take_rows(3, BOX, points, exact=True), len(lists)
         slots = np.zeros((n, SLOT), np.int32)
         for i, labels in enumerate(lists):
             slots[i, : len(labels)] = labels
@@ -254,7 +254,7 @@ def test_cells_with_two_faces_are_rejected(ctx, doubtful):
         sign = -1 if doubtful else 1
         rows.counts.set(np.array([sign * len(labels) for labels in lists], np.int32))
         rows.report.set(np.array([report.DOUBT * doubtful] + [0] * (report.SIZE - 1), np.int32))
-        flags, m = cells._match(rows, BOX, points, exact=True)
+        flags, m = cells._match(rows)
         assert m == 9 - two
         assert flags == (COLLAPSED if two else 0) | (report.DOUBT if doubtful else 0)
 

@@ -75,7 +75,7 @@ def wrapped_rows(engine, points, first_reach=FIRST_REACH):
     """Return the numbers of faces after wrapping alone, 0 for cells left to clipping, and the rows."""
     n, x = len(points), engine.upload(points)
     cells, binned = Cells(engine), Bins(engine).build(BOX, x, n)
-    rows = cells.take_rows(n)
+    rows = cells.take_rows(n, BOX, x, exact=True)
     engine.run_each(
         cells._hulls.wrap_all_hulls,
         -(-n // (LANES * EIGHTS)),
@@ -108,7 +108,9 @@ def test_rows_are_those_of_clipping(engine, name):
     for wrap in (True, False):
         cells, binned = Cells(engine), Bins(engine).build(BOX, x, n)
         taken, take = [], cells.take_rows
-        cells.take_rows = lambda n, taken=taken, take=take, **options: taken.append(take(n, **options)) or taken[-1]
+        cells.take_rows = lambda *given, taken=taken, take=take, **options: (
+            taken.append(take(*given, **options)) or taken[-1]
+        )
         if not wrap:
             cells._hulls = None
         t = patch.fetch(cells.tessellate(Part.alone(x, BOX), binned, exact=False))
