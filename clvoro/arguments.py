@@ -48,10 +48,8 @@ def check_cell_values(name: str, values: object, n: int, *, finite: bool = True,
 
     With `finite` it is of float64, else of the type of `values`.
 
-    Raises
-    ------
-    InputError, InputTypeError
-        If they are no such real numbers, some are masked, or with `finite` some are not finite; names the first row.
+    Raises `InputError` or `InputTypeError` if they are no such real numbers, some are masked, or with `finite` some are
+    not finite; names the first row.
     """
     expected = f"expected ({n},) or ({n}, k)"
     try:
@@ -86,12 +84,8 @@ def check_cell_values(name: str, values: object, n: int, *, finite: bool = True,
 def check_points(points: object, domain: Domain, name: str = "points") -> np.ndarray:
     """Return `points` as a float64 array (n, d) inside `domain`; errors call them `name`.
 
-    Raises
-    ------
-    InputTypeError
-        If `points` is not an array of real numbers.
-    InputError
-        If its shape is not (n, d) with n >= 1, or a value is not finite or outside; names the first.
+    Raises `InputTypeError` if `points` is not an array of real numbers. Raises `InputError` if its shape is not (n, d)
+    with n >= 1, or a value is not finite or outside; names the first.
     """
     array = domain.check_rows(name, points)
     if len(array) == 0:
@@ -114,12 +108,8 @@ def check_points(points: object, domain: Domain, name: str = "points") -> np.nda
 def check_rows(name: str, value: object, d: int) -> np.ndarray:
     """Return `value`, an array_like of real numbers, as a float64 array (n, d); n may be 0.
 
-    Raises
-    ------
-    InputTypeError
-        If it holds anything but real numbers.
-    InputError
-        If it has another shape, or numbers are masked.
+    Raises `InputTypeError` if it holds anything but real numbers. Raises `InputError` if it has another shape, or
+    numbers are masked.
     """
     if np.ma.is_masked(value):
         raise InputError(

@@ -142,10 +142,7 @@ def _reader(path: Path) -> Callable[[Path, tuple[str, ...] | None, float | None]
 def _chosen(wanted: Iterable[str] | None, present: Iterable[str]) -> list[str]:
     """Return the names that are wanted, each once; all by default.
 
-    Raises
-    ------
-    FileError
-        If one is absent, or there are none.
+    Raises `FileError` if one is absent, or there are none.
     """
     there = list(present)
     absent = [name for name in wanted or () if name not in there]
@@ -322,16 +319,10 @@ def _of_netcdf(path: Path, wanted: tuple[str, ...] | None, time: float | None) -
 class _Coordinates(NamedTuple):
     """Where the values of a variable are.
 
-    Attributes
-    ----------
-    names : tuple of str
-        The variables with the coordinates.
-    along : str
-        The dimension of the values that counts places.
-    on_globe : bool
-        Whether the coordinates are longitudes and latitudes.
-    corners : str
-        By UGRID the variable with the nodes of each face or edge, if only nodes have coordinates.
+    - `names`: the variables with the coordinates.
+    - `along`: the dimension of the values that counts places.
+    - `on_globe`: whether the coordinates are longitudes and latitudes.
+    - `corners`: by UGRID the variable with the nodes of each face or edge, if only nodes have coordinates.
     """
 
     names: tuple[str, ...]

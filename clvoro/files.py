@@ -21,10 +21,7 @@ _NOWAIT = getattr(os, "O_NONBLOCK", 0)
 def open_plain(path: str | PathLike[str]) -> BufferedReader:
     """Open a regular file for reading, through symbolic links. All readers of the package use it.
 
-    Raises
-    ------
-    OSError
-        If the file cannot be opened, or is a folder, pipe, socket or device: these block or are endless.
+    Raises `OSError` if the file cannot be opened, or is a folder, pipe, socket or device: these block or are endless.
     """
     if "\0" in os.fsdecode(path):
         raise OSError(errno.EINVAL, "its name has zero bytes", os.fsdecode(path))
@@ -54,12 +51,8 @@ def unlogged(library: str) -> Iterator[None]:
 def read_text(path: str | PathLike[str], longest: int) -> str:
     """Return the text of a regular file in UTF-8, with or without a byte order mark.
 
-    Raises
-    ------
-    OSError
-        As `open_plain`, or if the file has more than `longest` bytes.
-    UnicodeDecodeError
-        If the file is not in UTF-8.
+    Raises `OSError`, as `open_plain`, or if the file has more than `longest` bytes. Raises `UnicodeDecodeError` if the
+    file is not in UTF-8.
     """
     found = bytearray()
     with open_plain(path) as file:

@@ -51,17 +51,10 @@ _COUNTS = (*_PROGRESS, "levels", "next_label")
 class Checkpointer:
     """Writes the state of a run to `path` every `every` seconds, at most once between two actions.
 
-    Parameters
-    ----------
-    path : str or path
-    every : float
-        Seconds between two checkpoints; 0 writes one after each action.
-    fingerprint : dict
-        See `run_fingerprint`.
-    schedule : list of Action
-        Before it begins.
-    peers : Peers
-        The parts of the run. All of them write together.
+    - `every`: seconds between two checkpoints; 0 writes one after each action.
+    - `fingerprint`: see `run_fingerprint`.
+    - `schedule`: before it begins.
+    - `peers`: the parts of the run. All of them write together.
     """
 
     def __init__(
@@ -149,25 +142,14 @@ class Checkpointer:
 class Saved:
     """A checkpoint that has been read and is valid in itself.
 
-    Parameters
-    ----------
-    path : str or path
-    peers : Peers
-        The parts of the resumed run. Each takes its share of the generators.
+    - `peers`: the parts of the resumed run. Each takes its share of the generators.
 
-    Attributes
-    ----------
-    levels : int
-        Number of coarser levels of the run.
-    parts : int
-        Number of parts that work on the saved level.
-    beginning : Beginning
-        What the run began with.
+    Its attributes:
+    - `levels`: number of coarser levels of the run.
+    - `parts`: number of parts that work on the saved level.
+    - `beginning`: what the run began with.
 
-    Raises
-    ------
-    InputError
-        If the file is missing, damaged, truncated or not a checkpoint.
+    Raises `InputError` if the file is missing, damaged, truncated or not a checkpoint.
     """
 
     def __init__(self, path: str | PathLike[str], peers: Peers = ALONE) -> None:
@@ -265,10 +247,7 @@ class Saved:
     def check_fingerprint(self, fingerprint: dict) -> None:
         """Compare the checkpoint with the `fingerprint` of this run.
 
-        Raises
-        ------
-        InputError
-            If the domain or a setting differs; the message has the first one.
+        Raises `InputError` if the domain or a setting differs; the message has the first one.
         """
         fingerprint = json.loads(json.dumps(fingerprint))
         for name in {**self.fingerprint, **fingerprint}:

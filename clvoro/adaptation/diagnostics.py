@@ -40,15 +40,9 @@ MAX_SPACING = 1 / 16
 def warn_of_narrow_parts(domain: Domain, size: Callable[[np.ndarray], np.ndarray]) -> None:
     """Warn if cells of the target size do not fit between the walls of `domain` somewhere, or into a dead end.
 
-    Parameters
-    ----------
-    domain : Domain
-    size : callable
-        Takes points (n, d) and returns target sizes (n,).
+    - `size`: takes points (n, d) and returns target sizes (n,).
 
-    Warns
-    -----
-    MismatchWarning
+    Warns with `MismatchWarning`.
     """
     strait, dead_end = domain.narrow_parts(size)
     found = strait or dead_end
@@ -67,9 +61,7 @@ def warn_of_moved_points(fixed: np.ndarray, diagram: Diagram, sizes: np.ndarray)
 
     They are the first generators of the run, whose target sizes are `sizes` (n,).
 
-    Warns
-    -----
-    MismatchWarning
+    Warns with `MismatchWarning`.
     """
     assert diagram.home is not None
     cells = np.flatnonzero((diagram.home >= 0) & (diagram.home < len(fixed)))
@@ -89,9 +81,7 @@ def warn_of_moved_points(fixed: np.ndarray, diagram: Diagram, sizes: np.ndarray)
 def warn_of_other_sizes(result: Result) -> None:
     """Warn if a method that keeps the number of cells ends with cells of a size far from that of the field.
 
-    Warns
-    -----
-    SizeErrorWarning
+    Warns with `SizeErrorWarning`.
     """
     mean = float(np.abs(result.size_error).mean())
     if mean < FAR_ERROR or len(result) == 1:  # another warning says that the size is larger than the domain
@@ -109,9 +99,7 @@ def warn_of_other_sizes(result: Result) -> None:
 def warn_of_errors(result: Result) -> None:
     """Warn if a converged mesh does not have the sizes of its field, and name the worst cell.
 
-    Warns
-    -----
-    SizeErrorWarning
+    Warns with `SizeErrorWarning`.
     """
     amounts = np.abs(result.size_error)
     worst = int(amounts.argmax())
@@ -162,9 +150,7 @@ def _ring(diagram: Diagram, i: int) -> np.ndarray:
 def warn_of_obtuse_triangles(result: Result) -> None:
     """Warn if a mesh on a sphere has obtuse triangles, and name the worst.
 
-    Warns
-    -----
-    ObtuseTrianglesWarning
+    Warns with `ObtuseTrianglesWarning`.
     """
     diagram, sizes, grid = result.diagram, result.target_size, result.measures.c_grid
     if grid.obtuse == 0:
@@ -195,26 +181,13 @@ def check_precision(sizing: Sizing, domain: Domain, points: np.ndarray, factor: 
 
     Positions in the domain's frame are rounded to multiples of 2^-24 (in single precision).
 
-    Parameters
-    ----------
-    points : (n, d) float64
-        Generators, or a sample of them on a coarser level, with the density of the cells.
+    - `points` (n, d) float64: generators, or a sample of them on a coarser level, with the density of the cells.
 
-    Returns
-    -------
-    float
-        The mean over `points` of the spacing of positions over h.
+    Return the mean over `points` of the spacing of positions over h.
 
-    Raises
-    ------
-    InputError
-        If h is less than the spacing of positions at one of `points`.
-
-    Warns
-    -----
-    PrecisionWarning
-        If round-off costs more than `MAX_ROUND_OFF_ERROR`, or the spacing is more than `MAX_SPACING` times h; on a
-        sphere also if edges are off by more than `MAX_EDGE_ERROR`.
+    Raises `InputError` if h is less than the spacing of positions at one of `points`.
+    Warns with `PrecisionWarning` if round-off costs more than `MAX_ROUND_OFF_ERROR`, or the spacing is more than
+    `MAX_SPACING` times h; on a sphere also if edges are off by more than `MAX_EDGE_ERROR`.
     """
     real = sizing.real
     spacing = float(np.finfo(real).eps) / 2 * domain.frame[1]

@@ -146,11 +146,8 @@ def check_memory(
 
     If parts share the run, these are the bytes of the largest part with its ghosts.
 
-    Raises
-    ------
-    MemoryLimitError
-        If `n`, all arrays or the largest array are too large. The message has the number of cells, and the bytes needed
-        and available.
+    Raises `MemoryLimitError` if `n`, all arrays or the largest array are too large. The message has the number of
+    cells, and the bytes needed and available.
     """
     device = engine.queue.device
     name, available = device.name.strip(), available_memory(device)
@@ -184,10 +181,7 @@ def check_memory(
 def holder_of_all(engine: Engine, n: float, domain: Domain) -> Engine:
     """Return an engine whose device holds the mesh of all parts, of `n` cells: the device of `engine`, else a CPU.
 
-    Raises
-    ------
-    MemoryLimitError
-        If neither does.
+    Raises `MemoryLimitError` if neither does.
     """
     alone = engine.alone()
     try:
@@ -205,9 +199,7 @@ def holder_of_all(engine: Engine, n: float, domain: Domain) -> Engine:
 def check_prisms(count: float) -> None:
     """Check that the host has memory for `count` prisms in layers of a solid; the device has none of them.
 
-    Raises
-    ------
-    MemoryLimitError
+    Raises `MemoryLimitError`.
     """
     needed, available = BYTES_PER_PRISM * count, host_memory()
     if needed > available:
@@ -236,12 +228,8 @@ def expected_images(domain: Domain, size: Callable[[np.ndarray], np.ndarray], n:
     They are counted in a sample: points beyond a periodic boundary that are not farther from it than the cells there
     reach.
 
-    Parameters
-    ----------
-    size : callable
-        h(points (k, d)) -> (k,), up to a constant factor.
-    tree : DensityTree
-        Of `size`.
+    - `size`: h(points (k, d)) -> (k,), up to a constant factor.
+    - `tree`: of `size`.
     """
     reach = IMAGE_REACH[domain.dim] * (tree.integral / n) ** (1 / domain.dim)
     x, images = sample_cells(domain, tree), 0.0
@@ -262,14 +250,9 @@ def expected_surplus(
     Sizes are evaluated at the generators. At jumps of h fine cells cover parts of the coarse side and count as too
     large, until new cells have been inserted.
 
-    Parameters
-    ----------
-    size : callable
-        h(points (k, d)) -> (k,).
-    tree : DensityTree
-        Of `size`, or of a multiple of it.
-    reach : float
-        Distance over h at which sizes are compared.
+    - `size`: h(points (k, d)) -> (k,).
+    - `tree`: of `size`, or of a multiple of it.
+    - `reach`: distance over h at which sizes are compared.
     """
     places = sample_cells(domain, tree)
     if not len(places):

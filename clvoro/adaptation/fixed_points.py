@@ -28,10 +28,7 @@ _ROUND_OFF = 1e-5
 def check_fixed(fixed: object, domain: Domain, real: np.dtype) -> np.ndarray:
     """Return positions of fixed generators as a float64 array (k, d); k is 0 for None and for empty arrays.
 
-    Raises
-    ------
-    InputError, InputTypeError
-        If they are not an array of distinct positions inside `domain`.
+    Raises `InputError` or `InputTypeError` if they are not an array of distinct positions inside `domain`.
     """
     if fixed is None:
         return np.empty((0, domain.dim))
@@ -57,10 +54,7 @@ def check_fixed(fixed: object, domain: Domain, real: np.dtype) -> np.ndarray:
 def _coordinates(points: object) -> np.ndarray:
     """Return the coordinates of shapely points: a Point, a MultiPoint, or a sequence of Points.
 
-    Raises
-    ------
-    InputTypeError
-        For other geometries.
+    Raises `InputTypeError` for other geometries.
     """
     parts = shapely.get_parts(np.atleast_1d(np.asarray(points, object)))
     other = [part for part in parts if not isinstance(part, shapely.Point) or part.is_empty]
@@ -72,22 +66,11 @@ def _coordinates(points: object) -> np.ndarray:
 def check_room(points: np.ndarray, domain: Domain, free: Domain, rows: np.ndarray, h: np.ndarray) -> None:
     """Check that cells of the sizes `h` (k,) around `points` (k, d) have room.
 
-    Parameters
-    ----------
-    free : Domain
-        The domain without layers.
-    rows : (m, d) array
-        Generators of layers.
+    - `free`: the domain without layers.
+    - `rows` (m, d) array: generators of layers.
 
-    Raises
-    ------
-    InputError
-        If a generator is in a layer, or on a wall.
-
-    Warns
-    -----
-    MismatchWarning
-        If one is near a wall, or two are near each other, for the sizes there.
+    Raises `InputError` if a generator is in a layer, or on a wall.
+    Warns with `MismatchWarning` if one is near a wall, or two are near each other, for the sizes there.
     """
     hidden = np.flatnonzero(~free.contains(points))
     if hidden.size:
@@ -131,10 +114,7 @@ def check_room(points: np.ndarray, domain: Domain, free: Domain, rows: np.ndarra
 def check_beside_borders(pairs: FixedGenerators, domain: Domain, wells: np.ndarray) -> None:
     """Check that generators `wells` (k, d) of the caller are outside of the balls around the borders of `domain`.
 
-    Raises
-    ------
-    InputError
-        If one is too near to a border for the size there.
+    Raises `InputError` if one is too near to a border for the size there.
     """
     if domain.borders is None or not len(wells) or not len(pairs.centers):
         return
@@ -153,21 +133,12 @@ def place_in_corners(
 ) -> FixedGenerators | None:
     """Return the generators around re-entrant corners and concave creases of `domain`, if there are any.
 
-    Parameters
-    ----------
-    free : Domain
-        The domain without layers.
-    wells, rows : (k, d) and (m, d) array
-        Fixed generators of the caller, and those of layers.
-    size : callable
-        Sizes (n,) at points (n, d).
-    n : int
-        Number of cells: where they are too few, there are none.
+    - `free`: the domain without layers.
+    - `wells`, `rows` (k, d) and (m, d) array: fixed generators of the caller, and those of layers.
+    - `size`: sizes (n,) at points (n, d).
+    - `n`: number of cells: where they are too few, there are none.
 
-    Warns
-    -----
-    MismatchWarning
-        If there is no room for them, or a generator of the caller is among them; says where.
+    Warns with `MismatchWarning` if there is no room for them, or a generator of the caller is among them; says where.
     """
     others = np.concatenate([wells, rows])
     around = domain.stations(size, free, others)
@@ -204,20 +175,13 @@ def take_places(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return generators and labels in which those at `fixed` (k, d) have taken the places of the nearest others.
 
-    Parameters
-    ----------
-    points : (n, d) real
-        In the device's coordinates.
-    labels : (n,) int32
-    n_fixed : int
-        Generators with smaller labels, those of layers, stay.
+    - `points` (n, d) real: in the device's coordinates.
+    - `labels`: (n,) int32
+    - `n_fixed`: generators with smaller labels, those of layers, stay.
 
-    Returns
-    -------
-    points, labels
-        More than `n` rows if there are too few others.
-    taken : (k,) int32
-        Labels of those whose places they have taken; -1 for none.
+    Results:
+    - points, labels: more than `n` rows if there are too few others.
+    - `taken` (k,) int32: labels of those whose places they have taken; -1 for none.
     """
     taken = find_places(points, labels, fixed, domain, n_fixed)
     return *put_fixed(points, labels, fixed, taken, domain), taken
@@ -326,12 +290,8 @@ def put_back(diagram: Diagram, fixed: np.ndarray) -> None:
 def origins(labels: np.ndarray, started: int, taken: np.ndarray) -> np.ndarray:
     """Return the index in the points at the start for generators with `labels` (n,) in ascending order, or -1, (n,).
 
-    Parameters
-    ----------
-    started : int
-        Number of labels at the start: first those of the k fixed generators.
-    taken : (k,) int32
-        Labels of those whose places fixed generators have taken, or -1.
+    - `started`: number of labels at the start: first those of the k fixed generators.
+    - `taken` (k,) int32: labels of those whose places fixed generators have taken, or -1.
     """
     k = len(taken)
     before = np.where(labels < k, np.append(taken, -1)[np.minimum(labels, k)], labels)

@@ -61,10 +61,7 @@ class ResultParts:
     def gather(self, result: Result) -> Result | None:
         """Return the whole mesh on part 0, and None on the others.
 
-        Raises
-        ------
-        MemoryLimitError
-            On part 0, if neither its device nor a CPU has enough memory.
+        Raises `MemoryLimitError` on part 0, if neither its device nor a CPU has enough memory.
         """
         peers = self.engine.peers
         rows, labels = self.rows.gather(peers), peers.collect(self.labels)

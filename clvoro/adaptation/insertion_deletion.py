@@ -117,19 +117,11 @@ class InsertionDeletion:
 
         All parts of a domain call this together, with labels in their diagrams.
 
-        Parameters
-        ----------
-        generators : Generators
-            The present ones.
-        next_label : int
-            First label of new generators.
-        fixed : int
-            Generators with labels below `fixed` do not change, and next to them only the number is corrected.
+        - `generators`: the present ones.
+        - `next_label`: first label of new generators.
+        - `fixed`: generators with labels below `fixed` do not change, and next to them only the number is corrected.
 
-        Returns
-        -------
-        Outcome or None
-            None if nothing changes.
+        None if nothing changes.
         """
         n = self._count(t)
         # A remainder of less than 0.7 generators only changes the sizes of cells. A large change takes several calls.
@@ -171,22 +163,13 @@ class InsertionDeletion:
         A very bad cell is where lattice defects are stuck in a poor arrangement. One generator less, or more, leads to
         another arrangement, which is usually better.
 
-        Parameters
-        ----------
-        quality : (n,) real
-        generators, next_label, fixed
-            As for `insert_delete`.
-        deficit : float
-            1 - Q above which a cell is repaired.
-        split : bool
-            Split six-sided cells; otherwise delete them. Cells of more sides are split, cells of fewer deleted.
-        share : float
-            Largest share of the cells to repair. A mesh for which that is less than one cell does not change.
+        - `quality`: (n,) real
+        - `generators`, `next_label`, `fixed`: as for `insert_delete`.
+        - `deficit`: 1 - Q above which a cell is repaired.
+        - `split`: split six-sided cells; otherwise delete them. Cells of more sides are split, cells of fewer deleted.
+        - `share`: largest share of the cells to repair. A mesh for which that is less than one cell does not change.
 
-        Returns
-        -------
-        Outcome or None
-            None if nothing changes.
+        None if nothing changes.
         """
         engine, k, n = self.engine, self._kernels, t.n
         most = int(share * self._count(t))

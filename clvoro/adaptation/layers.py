@@ -46,10 +46,7 @@ class Layout:
     def beyond(self, points: np.ndarray) -> np.ndarray:
         """Return the indices of the `points` of the caller, (n, d), that are beyond the layers.
 
-        Raises
-        ------
-        InputError
-            If there are none.
+        Raises `InputError` if there are none.
         """
         beyond = self.layers.beyond(points)
         if not beyond.any():
@@ -62,9 +59,7 @@ class Layout:
     def warn_of_mismatches(self) -> None:
         """Warn of parts of the input that do not match the domain, and of layers that do not match the size field.
 
-        Warns
-        -----
-        MismatchWarning
+        Warns with `MismatchWarning`.
         """
         found = self.domain.warnings() + self.given.warnings(self.domain)
         for text in found + self.layers.mismatches(self.given):
@@ -76,18 +71,11 @@ def lay_out(
 ) -> Layout:
     """Place `layers` in `domain`, and limit the size `field` beside them.
 
-    Parameters
-    ----------
-    n_cells : int or None
-        Number of cells that the caller wants.
-    n_fixed : int
-        Number of fixed generators.
+    - `n_cells`: number of cells that the caller wants.
+    - `n_fixed`: number of fixed generators.
 
-    Raises
-    ------
-    InputError
-        If layers meet or do not fit, or leave no cells of `n_cells` for the rest of the domain.
-    MemoryLimitError
+    Raises `InputError` if layers meet or do not fit, or leave no cells of `n_cells` for the rest of the domain. Raises
+    `MemoryLimitError`.
     """
     made, limited = PlacedLayers(domain), field
     if layers and domain.extrudes_layers:

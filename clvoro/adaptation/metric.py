@@ -14,15 +14,10 @@ from ..tessellation.device_diagram import Tessellation
 class Neighborhoods(NamedTuple):
     """Sets of neighbors that are compared with those of the last evaluation, on the device.
 
-    Attributes
-    ----------
-    labels : (n,) int32
-    signatures : (n,) uint64
-        Hashes of the sets of the last evaluation; become those of this one.
-    changed, ever_changed : (n,) real
-        Become 1 where the sets differ; `ever_changed` stays 1.
-    first : bool
-        There was no evaluation: the hashes are only set.
+    - `labels`: (n,) int32
+    - `signatures` (n,) uint64: hashes of the sets of the last evaluation; become those of this one.
+    - `changed`, `ever_changed` (n,) real: become 1 where the sets differ; `ever_changed` stays 1.
+    - `first`: there was no evaluation: the hashes are only set.
     """
 
     labels: cla.Array

@@ -36,17 +36,11 @@ class Moving:
 class Displacement:
     """What a step moves the generators by: ``lloyd_share * lloyd + correction_share * correction``, bounded.
 
-    Attributes
-    ----------
-    lloyd, correction : (n, d) real
-        Its two parts, valid to the end of the workspace's frame.
-    unit : (n,) real
-        Unit of the bound, a length for each generator.
-    lloyd_share, correction_share : float
-    bound : float
-        Largest displacement over `unit`; 0 for no bound.
-    solution : Solution
-        Of the linear system of the step.
+    - `lloyd`, `correction` (n, d) real: its two parts, valid to the end of the workspace's frame.
+    - `unit` (n,) real: unit of the bound, a length for each generator.
+    - `lloyd_share`, `correction_share`: float
+    - `bound`: largest displacement over `unit`; 0 for no bound.
+    - `solution`: of the linear system of the step.
     """
 
     lloyd: cla.Array
@@ -61,10 +55,7 @@ class Displacement:
 class Method(ABC):
     """A way to move generators.
 
-    Attributes
-    ----------
-    finished : bool or None
-        Whether the method has met a tolerance of its own; None if it has none, and error and quality decide.
+    - `finished`: whether the method has met a tolerance of its own; None if it has none, and error and quality decide.
     """
 
     finished: bool | None = None

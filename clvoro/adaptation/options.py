@@ -221,15 +221,8 @@ class Checkpoint:
 class Options:
     """All options of a run in one place; see `Adapter.run`. `levels` is settled when the number of cells is known.
 
-    Raises
-    ------
-    InputError, InputTypeError
-        If a value is not as expected.
-
-    Warns
-    -----
-    UnusedOptionWarning
-        If an option is given that the method does not use.
+    Raises `InputError` or `InputTypeError` if a value is not as expected.
+    Warns with `UnusedOptionWarning` if an option is given that the method does not use.
     """
 
     method: str = "adaptive"
@@ -327,10 +320,7 @@ class RunArguments(NamedTuple):
     def checked(self, real: np.dtype) -> RunArguments:
         """Return the same with arrays in place of `points` and `fixed`, and a `Checkpoint`.
 
-        Raises
-        ------
-        InputError, InputTypeError
-            If generators are not distinct positions inside the domain.
+        Raises `InputError` or `InputTypeError` if generators are not distinct positions inside the domain.
         """
         files = self.checkpoint if isinstance(self.checkpoint, Checkpoint) else Checkpoint(self.checkpoint)
         points = None if self.points is None else check_points(self.points, self.domain)
@@ -340,9 +330,7 @@ class RunArguments(NamedTuple):
 def check_callback(callback: Callable[[np.void], object] | None) -> None:
     """Check the function that a run calls with each row of its history.
 
-    Raises
-    ------
-    InputTypeError
+    Raises `InputTypeError`.
     """
     if callback is None:
         return
@@ -377,9 +365,7 @@ def uses(method: str, option: str) -> bool:
 def warn_of_unused(given: Mapping[str, object], methods: Sequence[str]) -> None:
     """Warn of each option that is `given` and that none of `methods` uses.
 
-    Warns
-    -----
-    UnusedOptionWarning
+    Warns with `UnusedOptionWarning`.
     """
     defaults = {option.name: option.default for option in fields(Options)}
     for name, value in given.items():

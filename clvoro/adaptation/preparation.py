@@ -101,14 +101,9 @@ class Plan:
 def prepare(stages: Stages, arguments: RunArguments, max_levels: int | None = None) -> Prepared:
     """Check the `arguments` of a run, which are checked one by one, against each other; count cells, levels and bytes.
 
-    Parameters
-    ----------
-    max_levels : int, optional
-        Largest automatic number of coarser levels.
+    - `max_levels`: largest automatic number of coarser levels.
 
-    Raises
-    ------
-    InputError, InputTypeError, SizeFieldError, MemoryLimitError
+    Raises `InputError`, `InputTypeError`, `SizeFieldError` or `MemoryLimitError`.
     """
     domain, _, options, points, fixed, _ = arguments
     _check_together(arguments)

@@ -32,13 +32,9 @@ class Refinement:
     ) -> cla.Array:
         """Return about 2^d times as many generators, (n', d): those of `t`, then the new ones.
 
-        Parameters
-        ----------
-        h : (n,) real
-            Size on the new level, at the generators of `t`.
-        labels : (n,) int32, optional
-        fixed : int
-            Generators with labels below `fixed`, and edges that end in them, get no new generators.
+        - `h` (n,) real: size on the new level, at the generators of `t`.
+        - `labels`: (n,) int32
+        - `fixed`: generators with labels below `fixed`, and edges that end in them, get no new generators.
         """
         engine, k, n = self.engine, self._kernels, t.n
         fixed_args = *t.fixed_args(engine, labels, fixed), *t.name_args

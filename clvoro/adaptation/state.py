@@ -138,44 +138,26 @@ class Setup:
 class MeshState:
     """Generators of one level with their diagram, sizes, error and quality, all on the device.
 
-    Parameters
-    ----------
-    setup : Setup
-    size_factor : float
-        Factor on the size field: 2^k on level k above the finest.
-    start : dict of device arrays, or Arrays
-        Points and labels of the generators, removed from the dict; or those arrays of another mesh from which all
-        others follow (`Arrays.kept`).
-    coarser : Tessellator, optional
-        Tessellator of the coarser level.
-    next_label : int, optional
-        Label of the next generator; by default the number of generators.
-    taken : (k,) int32, optional
-        As the attribute; by default -1.
+    - `size_factor`: factor on the size field: 2^k on level k above the finest.
+    - `start`: points and labels of the generators, removed from the dict; or those arrays of another mesh from which
+      all others follow (`Arrays.kept`).
+    - `coarser`: tessellator of the coarser level.
+    - `next_label`: label of the next generator; by default the number of generators.
+    - `taken` (k,) int32: as the attribute; by default -1.
 
-    Attributes
-    ----------
-    n, total : int
-        Number of generators of this part, and of all parts of the domain.
-    points : (n, d) real
-        Normalized coordinates, in the order of the bins.
-    labels : (n,) int32
-        Permanent names of the generators.
-    velocity : (n, d) real
-        Displacement in the last step.
-    signatures : (n,) uint64
-        Hashes of the sets of neighbors; see `Neighborhoods`.
-    ever_changed : (n,) real
-        1 where the set of neighbors has changed in a step on this level, else 0.
-    h, error, quality : (n,) real
-    local_length : (n,) real
-        min(L, h), the unit of bounds of the motion.
-    follows_log_ratio : bool
-        Summarize log(L / h) with error and quality, so that `mean_log_ratio_error` needs no transfer of its own.
-    taken : (k,) int32
-        Labels of those whose places fixed generators have taken; -1 for none.
-    power : Tessellator or None
-        What made the present diagram, if it is a power diagram.
+    Its attributes:
+    - `n`, `total`: number of generators of this part, and of all parts of the domain.
+    - `points` (n, d) real: normalized coordinates, in the order of the bins.
+    - `labels` (n,) int32: permanent names of the generators.
+    - `velocity` (n, d) real: displacement in the last step.
+    - `signatures` (n,) uint64: hashes of the sets of neighbors; see `Neighborhoods`.
+    - `ever_changed` (n,) real: 1 where the set of neighbors has changed in a step on this level, else 0.
+    - `h`, `error`, `quality`: (n,) real
+    - `local_length` (n,) real: min(L, h), the unit of bounds of the motion.
+    - `follows_log_ratio`: summarize log(L / h) with error and quality, so that `mean_log_ratio_error` needs no transfer
+      of its own.
+    - `taken` (k,) int32: labels of those whose places fixed generators have taken; -1 for none.
+    - `power`: what made the present diagram, if it is a power diagram.
     """
 
     points = _property("generators", "points")
@@ -353,14 +335,10 @@ class MeshState:
     def set_generators(self, rows: dict[str, cla.Array], first: bool = False, inserted: int = 0) -> None:
         """Replace the generators, sort them by bin for locality in memory, and update the mesh.
 
-        Parameters
-        ----------
-        rows : dict of device arrays
-            The fields of `Generators`, removed from the dict. Memory is freed only if there is no other reference.
-        first : bool
-            There are no earlier ones.
-        inserted : int
-            How many of them are new.
+        - `rows`: the fields of `Generators`, removed from the dict. Memory is freed only if there is no other
+          reference.
+        - `first`: there are no earlier ones.
+        - `inserted`: how many of them are new.
         """
         stages, peers = self.stages, self.engine.peers
         if peers.count > 1 and (first or not is_balanced(len(rows["points"]), peers)):
@@ -386,12 +364,8 @@ class MeshState:
         An update of the last diagram is evaluated before the host knows whether it is right. All that the host needs is
         read in one transfer: the report of the update, the summaries, and whether all sizes are valid.
 
-        Parameters
-        ----------
-        first : bool
-            There is no earlier diagram to compare neighbors with.
-        binned : BinnedPoints, optional
-            The points in their bins, if the caller has them.
+        - `first`: there is no earlier diagram to compare neighbors with.
+        - `binned`: the points in their bins, if the caller has them.
         """
         stages, data = self.stages, self._data
         data.weights = None

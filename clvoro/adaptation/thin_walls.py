@@ -40,13 +40,9 @@ class ThinWalls:
     def pair(self, free: Domain, t: Tessellation, h: cla.Array, moving: Moving) -> None:
         """Move generators on both sides of thin walls to be mirror images of each other.
 
-        Parameters
-        ----------
-        free : Domain
-            The part of the polygon without layers, in its frame. Generators do not leave it.
-        t : Tessellation
-            Diagram of the same generators before their last displacement.
-        h : (n,) real
+        - `free`: the part of the polygon without layers, in its frame. Generators do not leave it.
+        - `t`: diagram of the same generators before their last displacement.
+        - `h`: (n,) real
         """
         engine, k = self.engine, self._kernels
         assert t.trimmed is not None

@@ -55,44 +55,28 @@ _MUCH = 2**26
 class Job:
     """One call of `clvoro run`.
 
-    Attributes
-    ----------
-    case : Case
-    out : Path
-        Folder for the files; created if needed.
-    device : str or None
-        As `clvoro.create_context` takes it. Several devices, separated by commas without blanks, share the run.
-    report : bool
-        Whether to draw pictures and write `report.html`.
-    mesh_formats : tuple of str
-        Further mesh files, keys of `MESH_FILES`.
-    picture_formats : tuple of str
-        Kinds of picture files.
-    quiet, as_json : bool
-        No progress and no summary; one JSON object per finished run on the standard output.
-    profile : bool
-        Whether to time every kernel, and print where the time went.
-    checkpoint, resume : Path or None
-    checkpoint_every : float or None
-        As `Adapter.run` takes them; for one method only.
-    walls : "straight", "exact" or None
-        As `save` takes it, for the mesh file of OpenFOAM and the check.
-    command : tuple of str
-        The arguments of the command, to be repeated after an interruption.
-    types : dict
-        Types of OpenFOAM's patches by name, before those of the case.
-    unchecked : bool
-        Write a mesh for OpenFOAM even if its checkMesh rejects it.
-    solver : "openfoam" or None
-        Check the mesh by the criteria of this solver, and with its own program if that is installed.
-    processors : int or None
-        Also write a decomposed case for OpenFOAM, or the partition of `graph.info`, with this number of processors.
-    peers : Peers
-        The ranks that share the run under `mpiexec`. Each has the same job; rank 0 gathers the mesh and writes it.
-    pieces : bool
-        Each rank writes its own cells, and rank 0 does not gather the mesh.
-    share_gpus : bool
-        Whether several ranks may have one GPU.
+    - `case`: Case
+    - `out`: folder for the files; created if needed.
+    - `device`: as `clvoro.create_context` takes it. Several devices, separated by commas without blanks, share the run.
+    - `report`: whether to draw pictures and write `report.html`.
+    - `mesh_formats`: further mesh files, keys of `MESH_FILES`.
+    - `picture_formats`: kinds of picture files.
+    - `quiet`, `as_json`: no progress and no summary; one JSON object per finished run on the standard output.
+    - `profile`: whether to time every kernel, and print where the time went.
+    - `checkpoint`, `resume`: Path or None
+    - `checkpoint_every`: as `Adapter.run` takes them; for one method only.
+    - `walls` "straight", "exact" or None: as `save` takes it, for the mesh file of OpenFOAM and the check.
+    - `command`: the arguments of the command, to be repeated after an interruption.
+    - `types`: types of OpenFOAM's patches by name, before those of the case.
+    - `unchecked`: write a mesh for OpenFOAM even if its checkMesh rejects it.
+    - `solver` "openfoam" or None: check the mesh by the criteria of this solver, and with its own program if that is
+      installed.
+    - `processors`: also write a decomposed case for OpenFOAM, or the partition of `graph.info`, with this number of
+      processors.
+    - `peers`: the ranks that share the run under `mpiexec`. Each has the same job; rank 0 gathers the mesh and writes
+      it.
+    - `pieces`: each rank writes its own cells, and rank 0 does not gather the mesh.
+    - `share_gpus`: whether several ranks may have one GPU.
     """
 
     case: Case
@@ -123,12 +107,8 @@ class Job:
     def run(self) -> bool:
         """Run all methods, write the files, print the summary; return whether it was interrupted.
 
-        Raises
-        ------
-        ClvoroError
-            If the input is bad, there is no device, or a run fails.
-        OSError
-            If the output cannot be written.
+        Raises `ClvoroError` if the input is bad, there is no device, or a run fails. Raises `OSError` if the output
+        cannot be written.
         """
         size, settings = self.peers.agree(self._prepare)
         adapter = self.peers.agree(self._make_adapter)

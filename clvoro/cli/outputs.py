@@ -16,9 +16,7 @@ from .cases import WRITTEN
 def refuse_own_files(folder: Path, named: Mapping[str, Path | None]) -> None:
     """Reject input files that the results of a run in `folder` would replace; `named` maps their purpose to the path.
 
-    Raises
-    ------
-    InputError
+    Raises `InputError`.
     """
     for what, path in named.items():
         if path is None:
@@ -34,10 +32,7 @@ def refuse_own_files(folder: Path, named: Mapping[str, Path | None]) -> None:
 def check_folder(folder: Path) -> None:
     """Create `folder` if needed and check that a file can be written there.
 
-    Raises
-    ------
-    InputError, OutputError
-        Before any work that would be lost.
+    Raises `InputError` or `OutputError` before any work that would be lost.
     """
     make_folder(folder)
     check_writable(folder)

@@ -41,14 +41,9 @@ def during(text: str, quiet: bool, task: Callable[[], T]) -> T:
 class ProgressDisplay:
     """Shows the rows of the history of a run; call it with each row.
 
-    Parameters
-    ----------
-    title : str
-        The case and its method.
-    max_steps : int or None
-        Largest number of steps, if known. A run may stop earlier, so the remaining time is a bound.
-    stream : text stream
-        Usually the standard error.
+    - `title`: the case and its method.
+    - `max_steps`: largest number of steps, if known. A run may stop earlier, so the remaining time is a bound.
+    - `stream`: usually the standard error.
     """
 
     def __init__(self, title: str, max_steps: int | None, stream: TextIO | None = None) -> None:
@@ -160,10 +155,7 @@ def _duration(seconds: float) -> str:
 class Steady:
     """A text stream whose writes never fail; after an error the text is lost.
 
-    Attributes
-    ----------
-    error : OSError or None
-        The first error; later text is lost.
+    - `error`: the first error; later text is lost.
     """
 
     def __init__(self, stream: TextIO) -> None:

@@ -28,12 +28,8 @@ def this_rank() -> Peers:
 
     MPI is loaded only if `mpiexec`, or ``python -m mpi4py``, has started the process.
 
-    Raises
-    ------
-    MissingLibraryError
-        If `mpiexec` has started several processes, and mpi4py is not installed.
-    InputError
-        If mpi4py belongs to another MPI than `mpiexec`.
+    Raises `MissingLibraryError` if `mpiexec` has started several processes, and mpi4py is not installed. Raises
+    `InputError` if mpi4py belongs to another MPI than `mpiexec`.
     """
     count = _set_in_environment(_COUNTS, 1)
     if count == 1 and "mpi4py.MPI" not in sys.modules and "PMIX_RANK" not in os.environ:

@@ -97,10 +97,7 @@ class CGridMeasures:
 def measure_c_grid(diagram: Diagram) -> CGridMeasures:
     """Measure a diagram on a sphere or in the plane as a C grid.
 
-    Raises
-    ------
-    InputError
-        In 3D.
+    Raises `InputError` in 3D.
     """
     d, domain = diagram, diagram.domain
     diagram.demand_voronoi("c_grid")

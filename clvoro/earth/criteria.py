@@ -27,10 +27,7 @@ C grids take the value at the generator for the mean over the cell, which is of 
 def check_for_mpas(diagram: Diagram, walls: WallShape | None) -> SolverReport:
     """Check `diagram` by the criteria of models on C grids.
 
-    Raises
-    ------
-    InputError
-        In 3D, or if `walls` is given.
+    Raises `InputError` in 3D, or if `walls` is given.
     """
     if walls is not None:
         raise InputError(f"walls is {walls!r:.60}, and solver 'mpas'; walls are for 'openfoam', leave it out")

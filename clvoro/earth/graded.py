@@ -36,17 +36,9 @@ class ArcGraded(Field):
     It is computed on a grid of longitude and latitude whose nodes are the centers of pixels, by the scheme of
     `gradation.cl`. The grid is closed across the date line and across the poles.
 
-    Parameters
-    ----------
-    given : Graded
-    field : Field
-        The field of `given`, for positions on the sphere.
-    sphere : Sphere
+    - `field`: the field of `given`, for positions on the sphere.
 
-    Raises
-    ------
-    InputError
-        If `given` has a box that is not this sphere, or several numbers as its resolution.
+    Raises `InputError` if `given` has a box that is not this sphere, or several numbers as its resolution.
     """
 
     dim, on_sphere = 3, True

@@ -49,11 +49,8 @@ class MeshInFile:
 def make_diagram(cells: MeshInFile) -> Diagram:
     """Return the diagram of `cells`. If they do not cover the whole sphere, its domain is a `SphereRegion`.
 
-    Raises
-    ------
-    FileError
-        If positions are not on the sphere, a cell has fewer than two corners or is not counter-clockwise, or a face
-        is in more than two cells.
+    Raises `FileError` if positions are not on the sphere, a cell has fewer than two corners or is not
+    counter-clockwise, or a face is in more than two cells.
     """
     n, radius = len(cells.points), cells.radius
     if not n or not np.isfinite(radius) or radius <= 0:

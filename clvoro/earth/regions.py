@@ -423,17 +423,11 @@ def widen_straits(diagram: Diagram, water: np.ndarray, fixed: np.ndarray) -> tup
     can become water if its neighbors in the water form a single run. Then land and water keep their connected parts: no
     land bridge opens, and no island disappears.
 
-    Parameters
-    ----------
-    diagram : Diagram
-    water, fixed : (n,) bool
-        Water cells, and land cells that stay land.
+    - `water`, `fixed` (n,) bool: water cells, and land cells that stay land.
 
-    Returns
-    -------
-    water : (n,) bool
-    left : (k,) int
-        Cells that are still narrow.
+    Results:
+    - `water`: (n,) bool
+    - `left` (k,) int: cells that are still narrow.
     """
     wet = water.copy()
     starts, neighbors = diagram.neighbor_starts.tolist(), diagram.neighbors

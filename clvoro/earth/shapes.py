@@ -83,11 +83,9 @@ def area_of(name: str, shape: object) -> LonLatArea:
     360 degrees, from -180 to 180, goes along its whole parallel. A ring around a pole is on one side of the equator, or
     closed along the pole, from (180, 90) to (-180, 90).
 
-    Raises
-    ------
-    InputError, InputTypeError
-        If `shape` is something else, has no area, or has positions that are not longitudes and latitudes in degrees; or
-        if a ring goes around the globe and crosses the equator, or goes around it more than once.
+    Raises `InputError` or `InputTypeError` if `shape` is something else, has no area, or has positions that are not
+    longitudes and latitudes in degrees; or if a ring goes around the globe and crosses the equator, or goes around it
+    more than once.
     """
     if isinstance(shape, Polygon):
         pieces = _pieces_of_polygon(shape)
@@ -111,10 +109,8 @@ def area_of(name: str, shape: object) -> LonLatArea:
 def lines_of(name: str, lines: Any) -> list[np.ndarray]:
     """Return lines (k, 2) with continuous longitudes; see `_LINES` for what they are given as.
 
-    Raises
-    ------
-    InputError, InputTypeError
-        If there are no lines, a line has fewer than two positions, or a position is not a longitude and a latitude.
+    Raises `InputError` or `InputTypeError` if there are no lines, a line has fewer than two positions, or a position is
+    not a longitude and a latitude.
     """
     if isinstance(lines, str | PathLike | Mapping):
         found, where = read_geojson(lines)
@@ -148,10 +144,8 @@ def lines_of(name: str, lines: Any) -> list[np.ndarray]:
 def check_lonlat(name: str, positions: object) -> np.ndarray:
     """Return `positions` as an array (k, 2) of longitudes and latitudes in degrees.
 
-    Raises
-    ------
-    InputError, InputTypeError
-        If it is not an array of finite numbers of this shape, or a latitude is beyond 90, or a longitude beyond 720.
+    Raises `InputError` or `InputTypeError` if it is not an array of finite numbers of this shape, or a latitude is
+    beyond 90, or a longitude beyond 720.
     """
     x = check_rows(name, positions, 2)
     bad = ~np.isfinite(x).all(axis=1) | (np.abs(x[:, 1]) > 90) | (np.abs(x[:, 0]) > _FARTHEST)

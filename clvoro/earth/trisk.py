@@ -35,13 +35,8 @@ class Weights:
 def find_weights(halves: HalfEdges, shares: np.ndarray, lengths: np.ndarray, distances: np.ndarray) -> Weights:
     """Return the weights. The normal of an edge points out of its lower cell.
 
-    Parameters
-    ----------
-    halves : HalfEdges
-    shares : (h,) float
-        Share of the kite at the begin of each half-edge in the area of its cell.
-    lengths, distances : (e,) float
-        Lengths of edges, and distances between their generators.
+    - `shares` (h,) float: share of the kite at the begin of each half-edge in the area of its cell.
+    - `lengths`, `distances` (e,) float: lengths of edges, and distances between their generators.
     """
     sides = halves.counts[halves.cell]
     first, twin = halves.first, halves.twin[halves.first]

@@ -163,12 +163,7 @@ def _numbers_or_names(edges: object) -> tuple[int | str, ...]:
 
 
 class PlacedLayers:
-    """The layers of a domain: rows of generators in 2D, prisms in a solid. This one has none.
-
-    Parameters
-    ----------
-    domain : Domain
-    """
+    """The layers of a domain: rows of generators in 2D, prisms in a solid. This one has none."""
 
     points: np.ndarray
     """(n, d) float. Generators of layers, which do not move. Layers of prisms have none."""
@@ -210,26 +205,13 @@ class PlacedLayers:
 class LayerRows(PlacedLayers):
     """Layers along walls in 2D: rows of generators that do not move, in columns normal to the walls.
 
-    Parameters
-    ----------
-    domain : Box or Polygon
-    layers : sequence of Layers
+    - `polygon`: the domain.
+    - `edges` (e, 2, 2) float: both ends of its oriented edges.
+    - `chosen`, `chains` list of (e,) bool, list of list of Chain: for each of the layers, the edges that have it, and
+      these joined.
 
-    Attributes
-    ----------
-    polygon : Polygon
-        The domain.
-    edges : (e, 2, 2) float
-        Both ends of its oriented edges.
-    chosen, chains : list of (e,) bool, list of list of Chain
-        For each of the layers, the edges that have it, and these joined.
-
-    Raises
-    ------
-    InputError
-        If an edge does not exist.
-    InputTypeError
-        If the domain is neither a `Box` nor a `Polygon` in 2D.
+    Raises `InputError` if an edge does not exist. Raises `InputTypeError` if the domain is neither a `Box` nor a
+    `Polygon` in 2D.
     """
 
     def __init__(self, domain: Domain, layers: Sequence[Layers]) -> None:
@@ -245,10 +227,7 @@ class LayerRows(PlacedLayers):
     def count(self) -> int:
         """Return the number of generators that `points` begins with, without placing any.
 
-        Raises
-        ------
-        InputError
-            If the layers of one wall alone fill the domain.
+        Raises `InputError` if the layers of one wall alone fill the domain.
         """
         total = 0
         for layer, chains in zip(self.layers, self.chains, strict=True):
@@ -282,10 +261,7 @@ class LayerRows(PlacedLayers):
 
         In corners and narrow gaps, where layers of several walls overlap, a generator is kept for its nearest wall.
 
-        Raises
-        ------
-        InputError
-            If none is in the domain.
+        Raises `InputError` if none is in the domain.
         """
         found, limits, walls = [np.empty((0, 2))], [np.empty(0)], [np.empty(0)]
         for layer, chains, columns in zip(self.layers, self.chains, self._columns, strict=True):
@@ -350,10 +326,7 @@ class LayerRows(PlacedLayers):
 
         It begins a third of a width from the last row.
 
-        Raises
-        ------
-        InputError
-            If nothing is left.
+        Raises `InputError` if nothing is left.
         """
         domain = self.domain
         distances = [float(layer.rows[-1]) + _APART * layer.width for layer in self.layers]
@@ -393,10 +366,7 @@ class LayerRows(PlacedLayers):
         In a narrow place, where layers of two walls overlap, each row is kept for its nearest wall. Layers that reach
         beyond the middle of a long gap give spikes.
 
-        Raises
-        ------
-        InputError
-            With the place of a narrow gap, and the largest thickness that fits there.
+        Raises `InputError` with the place of a narrow gap, and the largest thickness that fits there.
         """
         begin, end = self.edges.swapaxes(0, 1)
         thickness = np.zeros(len(begin))
@@ -456,16 +426,8 @@ class LayerRows(PlacedLayers):
 class LayerPrisms(PlacedLayers):
     """Layers along walls of a solid: prisms over the polygons on the walls, in the mesh for solvers.
 
-    Parameters
-    ----------
-    solid : Solid
-    layers : sequence of Layers
-
-    Raises
-    ------
-    InputError
-        If layers are too many, a layer has a spacing, a patch has several layers, layers are thicker than the solid, or
-        patches that meet have layers of different count.
+    Raises `InputError` if layers are too many, a layer has a spacing, a patch has several layers, layers are thicker
+    than the solid, or patches that meet have layers of different count.
     """
 
     free: Solid

@@ -33,23 +33,14 @@ class Tree:
     ``order[j n // m : (j + 1) n // m]``. Each node halves its items across the longest side of the
     box of their centers. The tree depends on the items only.
 
-    Parameters
-    ----------
-    low, high : (n, d) float
-        Lower and upper corners of the items' bounding boxes.
-    order : (n,) int, optional
-        Another order of the items, in which near ones follow each other, such as `curve_order`.
-    leaf : int
-        Items of a leaf at most.
+    - `low`, `high` (n, d) float: lower and upper corners of the items' bounding boxes.
+    - `order` (n,) int: another order of the items, in which near ones follow each other, such as `curve_order`.
+    - `leaf`: items of a leaf at most.
 
-    Attributes
-    ----------
-    levels : int
-        Number of levels below the root; there are 2^levels leaves.
-    order : (n,) int
-        The items in the order of the leaves.
-    boxes : (2^(levels + 1) - 1, 2 d) float
-        Lower and upper corners of the nodes.
+    Its attributes:
+    - `levels`: number of levels below the root; there are 2^levels leaves.
+    - `order` (n,) int: the items in the order of the leaves.
+    - `boxes` (2^(levels + 1) - 1, 2 d) float: lower and upper corners of the nodes.
     """
 
     def __init__(self, low: np.ndarray, high: np.ndarray, order: np.ndarray | None = None, leaf: int = _LEAF):
@@ -106,20 +97,13 @@ class Tree:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return the squared distance of each of `points` to the nearest item, at most `bound2`, and that item.
 
-        Parameters
-        ----------
-        points : (n, d) float
-        bound2 : (n,) float
-            Items beyond this squared distance are skipped; a tighter bound is faster.
-        distance2 : callable
-            Returns the squared distances of points (m, d) to items (m,), given by index.
-        in_boxes : bool
-            Whether distances are those to places in the items' boxes. They may also be larger.
+        - `points`: (n, d) float
+        - `bound2` (n,) float: items beyond this squared distance are skipped; a tighter bound is faster.
+        - `distance2`: returns the squared distances of points (m, d) to items (m,), given by index.
+        - `in_boxes`: whether distances are those to places in the items' boxes. They may also be larger.
 
-        Returns
-        -------
-        (n,) float, (n,) int
-            Of items at the same distance the first one counts; -1 where no item is within the bound.
+        The result is (n,) float, (n,) int: of items at the same distance the first one counts; -1 where no item is
+        within the bound.
         """
         best2, best = bound2.copy(), np.full(len(points), -1)
         d = points.shape[1]

@@ -15,9 +15,7 @@ class Columns:
     it enters. Along an edge that two triangles share both decide by the same numbers, so that a ray crosses exactly one
     of them, whatever the round-off.
 
-    Parameters
-    ----------
-    corners : (t, 3, 3) float
+    - `corners`: (t, 3, 3) float
     """
 
     def __init__(self, corners: np.ndarray):

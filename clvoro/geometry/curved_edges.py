@@ -20,15 +20,10 @@ _OFF = 1e-6  # of a curve's extent: its largest distance from its vertices in a 
 class CurvedEdges:
     """Curves of a polygon, or of one ring, and the part of a curve that each edge stands for.
 
-    Attributes
-    ----------
-    curves : tuple of Curve
-    curve : (k,) int32
-        Number in `curves` for each edge; -1 for an edge that belongs to no curve.
-    span : (k,) int32
-        Number of the smooth part of the curve; -1 for a straight edge.
-    ends : (k, 2) float64
-        Parameters of the curve at the begin and the end of each edge.
+    - `curves`: tuple of Curve
+    - `curve` (k,) int32: number in `curves` for each edge; -1 for an edge that belongs to no curve.
+    - `span` (k,) int32: number of the smooth part of the curve; -1 for a straight edge.
+    - `ends` (k, 2) float64: parameters of the curve at the begin and the end of each edge.
     """
 
     curves: tuple[Curve, ...]
@@ -98,10 +93,7 @@ class CurvedEdges:
     def described(cls, values: object, begins: np.ndarray, ends: np.ndarray) -> CurvedEdges:
         """Return the edges from the values that `describe` returns; `begins`, `ends`: vertices of all edges, (k, 2).
 
-        Raises
-        ------
-        InputError, InputTypeError
-            If the values do not describe curves through the vertices.
+        Raises `InputError` or `InputTypeError` if the values do not describe curves through the vertices.
         """
         made = cls.straight(len(begins))
         curves = []
@@ -142,17 +134,10 @@ def unroll(ring: Any, name: str) -> tuple[np.ndarray, CurvedEdges]:
 
     Where a curve ends in a point of the ring, the point is the vertex. Straight edges join all other ends.
 
-    Parameters
-    ----------
-    ring : Curve, or list of curves and points
-    name : str
-        Name of the ring in errors.
+    - `name`: name of the ring in errors.
 
-    Raises
-    ------
-    InputError, InputTypeError
-        If the ring is one open curve, has a closed one beside other items, or a gap that is larger than round-off and
-        smaller than 1e-6 of the ring; names the place.
+    Raises `InputError` or `InputTypeError` if the ring is one open curve, has a closed one beside other items, or a gap
+    that is larger than round-off and smaller than 1e-6 of the ring; names the place.
     """
     items = [ring] if isinstance(ring, Curve) else list(ring)
     if isinstance(ring, Curve) and not ring.closed:

@@ -814,9 +814,7 @@ def images_in(domain: Domain, lower: np.ndarray, upper: np.ndarray, within: Any)
 
     `lower` and `upper` (n, d) are the corners of the cells' bounding boxes, `within` those of the box.
 
-    Returns
-    -------
-    list of (rows (k,), offset (d,))
+    The result is a list of (rows (k,), offset (d,)).
     """
     found = []
     for step in product(*((0, -1, 1) if p else (0,) for p in domain.periodic)):

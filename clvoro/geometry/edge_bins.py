@@ -22,12 +22,8 @@ _BEHIND = 16
 class EdgeBins:
     """Edges as arguments of kernels: EDGE_ARGS. They are freed with the workspace of the engine.
 
-    Parameters
-    ----------
-    begins, ends : (k, 2) float64
-        In the device's coordinates.
-    rounding : float
-        Round-off of a generator on an edge.
+    - `begins`, `ends` (k, 2) float64: in the device's coordinates.
+    - `rounding`: round-off of a generator on an edge.
     """
 
     def __init__(self, begins: np.ndarray, ends: np.ndarray, rounding: float) -> None:
@@ -53,16 +49,11 @@ class EdgeBins:
 def bin_edges(begins: np.ndarray, ends: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Sort edges from `begins` to `ends`, (k, 2) each, into bins.
 
-    Returns
-    -------
-    frame : (4,) float
-        Origin (2), 1 / width of a bin, and 0, which the caller replaces.
-    shape : (4,) int32
-        Number of bins along x and y, 0, 0.
-    starts : (bins + 1,) int32
-        Place in `listed` of the first edge of each bin, row by row.
-    listed : int
-        The edges that pass through each bin, or so near to it that round-off matters.
+    Results:
+    - `frame` (4,) float: origin (2), 1 / width of a bin, and 0, which the caller replaces.
+    - `shape` (4,) int32: number of bins along x and y, 0, 0.
+    - `starts` (bins + 1,) int32: place in `listed` of the first edge of each bin, row by row.
+    - `listed`: the edges that pass through each bin, or so near to it that round-off matters.
     """
     lower = np.minimum(begins, ends).min(axis=0)
     upper = np.maximum(begins, ends).max(axis=0)

@@ -37,18 +37,11 @@ def find_gaps(domain: Polygon, least: float, most: float) -> tuple[np.ndarray, n
     their distance is the width of a gap. At reentrant corners balls start in all directions between the normals of the
     two edges.
 
-    Parameters
-    ----------
-    domain : Polygon
-    least : float
-        Smallest width to resolve; it bounds the work.
-    most : float
-        Largest width of a gap.
+    - `least`: smallest width to resolve; it bounds the work.
+    - `most`: largest width of a gap.
 
-    Returns
-    -------
-    begin, end : (m, 2) float64
-        The points where the balls touch the boundary.
+    Results:
+    - `begin`, `end` (m, 2) float64: the points where the balls touch the boundary.
     """
     start, edge, length = domain.oriented.vertices, domain.oriented.along, domain.oriented.lengths
     normal = np.column_stack([-edge[:, 1], edge[:, 0]]) / length[:, None]
@@ -92,11 +85,7 @@ def find_narrow_parts(
     places whose walls are connected by less than `_TIP` sizes of boundary. For the second, these are
     `_DEAD_END` sizes at least, which is a bay of depth 2, or a corner of 28 degrees.
 
-    Parameters
-    ----------
-    domain : Polygon
-    size : callable
-        Takes points (n, 2) and returns target sizes (n,).
+    - `size`: takes points (n, 2) and returns target sizes (n,).
     """
     points, normals, along, h = _wall_samples(domain, size)
     begin, end, radius = _balls(domain, points, normals, 2 * h)

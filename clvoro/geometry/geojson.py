@@ -78,12 +78,9 @@ def pieces_of_geojson(
 ) -> tuple[list[list[object]], dict[str, list[int]] | None]:
     """Read the polygons in a GeoJSON file, text or object. With `planar`, warn of longitudes and latitudes.
 
-    Returns
-    -------
-    pieces : list of lists of rings
-        For each polygon its outer ring and its holes.
-    names : dict or None
-        Names of boundaries and the numbers of their edges, from the property "boundaries" of Features.
+    Results:
+    - `pieces`: for each polygon its outer ring and its holes.
+    - `names`: names of boundaries and the numbers of their edges, from the property "boundaries" of Features.
     """
     found, name = read_geojson(source)
     names: dict[str, list[int]] = {}

@@ -234,10 +234,8 @@ def _runs(lengths: np.ndarray, width: float, chain: Chain) -> tuple[np.ndarray, 
 
     Beside a corner with a fan, half a width belongs to the fan.
 
-    Returns
-    -------
-    runs, counts : (r,) float
-        Lengths of the parts, and the number of columns on each.
+    Results:
+    - `runs`, `counts` (r,) float: lengths of the parts, and the number of columns on each.
     """
     long = lengths >= _LONG * width
     first = np.flatnonzero(np.concatenate([[True], long[1:] & long[:-1], [True]]))

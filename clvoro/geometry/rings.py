@@ -142,15 +142,10 @@ def make_rings(pieces: Sequence[Sequence[object]]) -> list[list[Ring]]:
 
     Repeated vertices are dropped. Clockwise outer rings and counter-clockwise holes are reversed.
 
-    Parameters
-    ----------
-    pieces : sequence of sequences of array_like (k, 2)
-        For each piece its outer ring and its holes, closed by a repeated first vertex or not.
+    - `pieces` sequence of sequences of array_like (k, 2): for each piece its outer ring and its holes, closed by a
+      repeated first vertex or not.
 
-    Raises
-    ------
-    InputError, InputTypeError
-        If the rings are not those of a valid polygon; names the ring and the place.
+    Raises `InputError` or `InputTypeError` if the rings are not those of a valid polygon; names the ring and the place.
     """
     for p, piece in enumerate(pieces):
         if not hasattr(piece, "__len__"):
@@ -193,13 +188,10 @@ def repaired(
 ) -> tuple[list[list[np.ndarray]], dict[str, list[int]] | None, float]:
     """Return pieces whose rings do not cross, as `make_rings` takes them, of any rings; see `Polygon`.
 
-    Returns
-    -------
-    pieces : list of lists of (k, 2) float64
-    names : dict or None
-        Edges of the new rings for each of `names`: those nearest to an edge with the name.
-    change : float
-        By how much the area differs from the sum of the outer rings without their holes, over the new area.
+    Results:
+    - `pieces`: list of lists of (k, 2) float64
+    - `names`: edges of the new rings for each of `names`: those nearest to an edge with the name.
+    - `change`: by how much the area differs from the sum of the outer rings without their holes, over the new area.
     """
     flat = [_cleaned(ring, f"ring {k}") for k, ring in enumerate(ring for piece in pieces for ring in piece)]
     rings, shapes, before = iter(flat), [], 0.0

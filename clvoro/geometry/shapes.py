@@ -188,10 +188,7 @@ class Segment:
 def shapes_of(geometry: Any) -> list[Circle | Polyline]:
     """Return the points, lines and rings of a shapely geometry as shapes in 2D.
 
-    Raises
-    ------
-    InputError
-        If the geometry is empty.
+    Raises `InputError` if the geometry is empty.
     """
     if geometry.is_empty:
         raise InputError(f"the shape is {geometry!r:.40}, expected a geometry that is not empty")

@@ -30,21 +30,15 @@ class Subdomain(Domain):
     Its walls are those of the whole domain, then one for each face towards a removed cell, which lies on the bisector
     of two generators: that of its cell, and that of the removed cell.
 
-    Parameters
-    ----------
-    whole : Domain
-        The domain of the mesh before cells were removed.
-    within, beyond : (k, d) array
-        Generators on both sides of each face towards a removed cell, in a periodic box the nearest images.
-    area : float
-        Measure of the cells that are left.
-    names : mapping, optional
-        Names of boundaries, each with its walls. Faces towards removed cells that are not mentioned are the "coast".
+    - `whole`: the domain of the mesh before cells were removed.
+    - `within`, `beyond` (k, d) array: generators on both sides of each face towards a removed cell, in a periodic box
+      the nearest images.
+    - `area`: measure of the cells that are left.
+    - `names`: names of boundaries, each with its walls. Faces towards removed cells that are not mentioned are the
+      "coast".
 
-    Raises
-    ------
-    InputError, InputTypeError
-        If the arrays do not have this shape, a number is not finite or the area not positive, or names are wrong.
+    Raises `InputError` or `InputTypeError` if the arrays do not have this shape, a number is not finite or the area not
+    positive, or names are wrong.
     """
 
     whole: Domain

@@ -35,10 +35,7 @@ class FilePart(NamedTuple):
 def read_parts(path: str | PathLike[str], kinds: Iterable[str] = SURFACES) -> list[FilePart]:
     """Return the parts of a surface file: solids of an STL file, groups of an OBJ file, objects of a 3MF file.
 
-    Raises
-    ------
-    InputError
-        If trimesh is not installed, the file cannot be read, or it holds no triangles.
+    Raises `InputError` if trimesh is not installed, the file cannot be read, or it holds no triangles.
     """
     path = Path(path)
     kind = path.suffix.lower().lstrip(".")

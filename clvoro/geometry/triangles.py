@@ -57,17 +57,12 @@ def packed_rows(corners: np.ndarray, real: DTypeLike = np.float64) -> np.ndarray
 def packed_weights(x: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return where the point of each triangle nearest to each point x (m, 3) is, and the squared distance.
 
-    Parameters
-    ----------
-    x : (m, 3) float
-    rows : (m, 21) float
-        The triangles, from `packed_rows`.
+    - `x`: (m, 3) float
+    - `rows` (m, 21) float: the triangles, from `packed_rows`.
 
-    Returns
-    -------
-    s, t : (m,) float
-        The point is a + s (b - a) + t (c - a). On a side s, t or 1 - s - t is 0 to round-off.
-    distance2 : (m,) float
+    Results:
+    - `s`, `t` (m,) float: the point is a + s (b - a) + t (c - a). On a side s, t or 1 - s - t is 0 to round-off.
+    - `distance2`: (m,) float
     """
     x0, x1, x2 = (x - rows[:, :3]).T
 

@@ -38,23 +38,14 @@ _BLOCK = 1 << 20
 class WallTriangles:
     """Triangles of smooth patches as arguments of kernels; the workspace of the engine frees them.
 
-    Parameters
-    ----------
-    corners : (t, 3, 3) float
-        Positions, counter-clockwise from outside of the region.
-    patch : (t,) int
-        Number of the patch: faces there have the label ``-1 - patch``.
-    normals : (t, 3, 3) float
-        Unit normals of the patch at the corners, out of the region.
-    edges : (t, 3) int
-        `SMOOTH`, `CONVEX` or `CONCAVE` for the edge from corner s to corner s + 1.
-    ends : (t, 3) int
-        The same for corner s: `CONCAVE` where a concave crease of the patch passes or ends.
+    - `corners` (t, 3, 3) float: positions, counter-clockwise from outside of the region.
+    - `patch` (t,) int: number of the patch: faces there have the label ``-1 - patch``.
+    - `normals` (t, 3, 3) float: unit normals of the patch at the corners, out of the region.
+    - `edges` (t, 3) int: `SMOOTH`, `CONVEX` or `CONCAVE` for the edge from corner s to corner s + 1.
+    - `ends` (t, 3) int: the same for corner s: `CONCAVE` where a concave crease of the patch passes or ends.
 
-    Attributes
-    ----------
-    items : (k,) int
-        The triangles that have an area; only these are kept, by patch, and near ones after each other.
+    Its attributes:
+    - `items` (k,) int: the triangles that have an area; only these are kept, by patch, and near ones after each other.
     """
 
     def __init__(
@@ -93,12 +84,8 @@ class WallTriangles:
     def corner_normals(self, scale: float, size: Callable[[np.ndarray], np.ndarray] | None) -> np.ndarray:
         """Return the normals at the corners, and by how much planes are moved inwards there, (t, 3, 4).
 
-        Parameters
-        ----------
-        scale : float
-            Unit of the shift.
-        size : callable, optional
-            Size h of cells at points (k, 3), (k,); without it nothing is moved.
+        - `scale`: unit of the shift.
+        - `size`: size h of cells at points (k, 3), (k,); without it nothing is moved.
         """
         shift = np.zeros(self.edges.shape)
         tip, share, away = self._tips
@@ -158,18 +145,13 @@ def _divided_at_tips(
 
     Each is halved `TIP_STEPS` times towards the tip. Both triangles at a side are divided at the same points.
 
-    Returns
-    -------
-    source : (m,) int
-        The triangle that each one is a part of.
-    corners, normals, edges, ends : (m, 3, 3), (m, 3, 3), (m, 3), (m, 3)
-        As for `WallTriangles`. Normals at new points are those at the end of their side.
-    tip : (m, 3, 3) float
-        At new points the normal of the tip, elsewhere 0.
-    share : (m, 3) float
-        How far new points are along their side from the tip, over its length; elsewhere 1.
-    away : (m, 3) float
-        Distance of new points from the tip; elsewhere 0.
+    Results:
+    - `source` (m,) int: the triangle that each one is a part of.
+    - `corners`, `normals`, `edges`, `ends` (m, 3, 3), (m, 3, 3), (m, 3), (m, 3): as for `WallTriangles`. Normals at new
+      points are those at the end of their side.
+    - `tip` (m, 3, 3) float: at new points the normal of the tip, elsewhere 0.
+    - `share` (m, 3) float: how far new points are along their side from the tip, over its length; elsewhere 1.
+    - `away` (m, 3) float: distance of new points from the tip; elsewhere 0.
     """
     own = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     own /= np.linalg.norm(own, axis=1)[:, None]
@@ -223,18 +205,12 @@ def mean_curvature(corners: np.ndarray, normals: np.ndarray) -> np.ndarray:
 def bin_triangles(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Sort triangles with `corners` (t, 3, 3) into bins.
 
-    Returns
-    -------
-    frame : (4,) float
-        Origin (3) and 1 / width of a bin.
-    shape : (4,) int32
-        Number of bins along x, y and z, and 0.
-    starts : (bins + 1,) int32
-        Place in `listed` of the first triangle of each bin; x runs fastest.
-    listed : int
-        The triangles that pass through each bin, or so near to it that round-off matters, in ascending order.
-    clear : (bins,) uint8
-        Number of steps from each bin to the next one with a triangle, at most 255.
+    Results:
+    - `frame` (4,) float: origin (3) and 1 / width of a bin.
+    - `shape` (4,) int32: number of bins along x, y and z, and 0.
+    - `starts` (bins + 1,) int32: place in `listed` of the first triangle of each bin; x runs fastest.
+    - `listed`: the triangles that pass through each bin, or so near to it that round-off matters, in ascending order.
+    - `clear` (bins,) uint8: number of steps from each bin to the next one with a triangle, at most 255.
     """
     lower, upper = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
     extent = upper - lower

@@ -101,22 +101,12 @@ def write(
 ) -> None:
     """Write a mesh to `path` with `options` of its format; see `Diagram.save`, `to_openfoam`, `to_netcdf`, `to_vtu`.
 
-    Parameters
-    ----------
-    mesh : Result or Diagram
-        In a box, a polygon or a solid, or on a sphere.
-    path : str or path
-    cell_data : mapping, optional
-    kind : {".foam", ".nc", ".vtu"}, optional
-        The format that is meant. By default that of `path`.
-    **options
-        Those that are None are left out.
+    - `mesh`: in a box, a polygon or a solid, or on a sphere.
+    - `kind` {".foam", ".nc", ".vtu"}: the format that is meant. By default that of `path`.
+    - `**options`: those that are None are left out.
 
-    Raises
-    ------
-    InputError, InputTypeError
-        If the format is unknown, another than `kind`, or cannot hold the cells, an option is wrong or for another
-        format, or the file cannot be written. An existing file is then unchanged.
+    Raises `InputError` or `InputTypeError` if the format is unknown, another than `kind`, or cannot hold the cells, an
+    option is wrong or for another format, or the file cannot be written. An existing file is then unchanged.
     """
     contents = Contents.of(mesh, cell_data)
     path = Path(check_path("path", path))

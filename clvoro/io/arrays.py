@@ -127,10 +127,7 @@ def array_names(path: Path) -> list[str]:
 def read_array(path: Path, member: str = "points") -> np.ndarray:
     """Read an array from a `.npy` file, or the array `member` from a `.npz` file.
 
-    Raises
-    ------
-    InputError
-        If there is no such file, it does not have the array, or the array holds Python objects.
+    Raises `InputError` if there is no such file, it does not have the array, or the array holds Python objects.
     """
     with explained(path, "a .npy file"), open_plain(path) as file:
         if file.read(4) == b"PK\x03\x04":

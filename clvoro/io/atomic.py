@@ -35,10 +35,7 @@ def check_writable(path: str | PathLike[str]) -> None:
 def make_folder(path: str | PathLike[str]) -> None:
     """Create the folder `path` and its parents, if they do not exist.
 
-    Raises
-    ------
-    InputError
-        If it cannot be created.
+    Raises `InputError` if it cannot be created.
     """
     try:
         os.makedirs(path, exist_ok=True)
@@ -55,10 +52,7 @@ def atomic_file(path: str | PathLike[str]) -> Iterator[IO[bytes]]:
     The bytes are on the disk (fsync) before the file is renamed. If the block raises, the temporary file is removed,
     and the file at `path` is unchanged.
 
-    Raises
-    ------
-    OutputError
-        If the file cannot be written: no such folder, no permission, no space.
+    Raises `OutputError` if the file cannot be written: no such folder, no permission, no space.
     """
     path = Path(path)
     with writing(path):

@@ -40,12 +40,8 @@ _LONGEST = 32
 def write_cgns(contents: Contents, path: Path) -> None:
     """Write the cells, the boundaries by their names, and cell data, with h5py.
 
-    Raises
-    ------
-    MissingLibraryError
-        If h5py is not installed.
-    InputError
-        If the file cannot be written, or OpenFOAM could not hold the cells either; see `poly_mesh`.
+    Raises `MissingLibraryError` if h5py is not installed. Raises `InputError` if the file cannot be written, or
+    OpenFOAM could not hold the cells either; see `poly_mesh`.
     """
     try:
         import h5py

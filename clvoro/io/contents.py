@@ -126,10 +126,7 @@ def describe(domain: Domain) -> dict[str, Any]:
 def described(description: Mapping[str, Any]) -> Domain:
     """Return the domain that `describe` has described.
 
-    Raises
-    ------
-    FileError
-        If no class of this name is known.
+    Raises `FileError` if no class of this name is known.
     """
     values = dict(description)
     kind = values.pop("kind")

@@ -236,10 +236,7 @@ def write_metis(contents: Contents, path: Path) -> None:
     counted from 1, ascending. Neighbors share a face that has a measure; each is listed once, and no cell is its own
     neighbor, as METIS requires.
 
-    Raises
-    ------
-    InputError
-        If there are data of the caller, which the format does not hold.
+    Raises `InputError` if there are data of the caller, which the format does not hold.
     """
     if contents.extra:
         raise InputError(f"cannot write cell_data to {path}: a graph for METIS holds none; save as .nc or leave it out")
@@ -262,10 +259,7 @@ def write_partition(contents: Contents, path: Path, processors: ArrayLike | None
 
     `processors` (n,) int are these; by default parts of equal numbers of cells, divided by planes.
 
-    Raises
-    ------
-    InputError
-        If there are data of the caller, or fewer cells than processors.
+    Raises `InputError` if there are data of the caller, or fewer cells than processors.
     """
     if contents.extra:
         raise InputError(f"cannot write cell_data to {path}, which has the processor of each cell; leave it out")

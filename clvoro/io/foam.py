@@ -91,36 +91,24 @@ def poly_mesh(
     The patches are the boundaries of the domain by their names, then one pair of cyclic patches for each periodic
     direction (see `cyclic`), then in 2D `back` and `front`. Cells of a periodic box are not cut at its seams.
 
-    Parameters
-    ----------
-    patches : mapping, optional
-        Names of patches, each with its walls: numbers, names of the domain, or a sequence of them. Walls that are not
-        mentioned keep the name that the domain gives them.
-    types : mapping, optional
-        Type of each patch by name: "wall", "patch", "symmetry" or "symmetryPlane". By default that of `default_type`.
-    thickness : float, optional
-        In 2D: height of the prisms, whose bottoms are at z = 0. By default the mean width of a cell.
-    walls : {"straight", "exact"}, optional
-        See `Diagram.solver_mesh`.
-    check : bool, optional
-        Whether OpenFOAM must accept the mesh.
-    apart : bool, optional
-        See `cyclic_patches`.
+    - `patches`: names of patches, each with its walls: numbers, names of the domain, or a sequence of them. Walls that
+      are not mentioned keep the name that the domain gives them.
+    - `types`: type of each patch by name: "wall", "patch", "symmetry" or "symmetryPlane". By default that of
+      `default_type`.
+    - `thickness`: in 2D: height of the prisms, whose bottoms are at z = 0. By default the mean width of a cell.
+    - `walls` {"straight", "exact"}: see `Diagram.solver_mesh`.
+    - `check`: whether OpenFOAM must accept the mesh.
+    - `apart`: see `cyclic_patches`.
 
-    Returns
-    -------
-    Faces
-        The cells as polyhedra. The faces of the patches follow those between two cells, patch by patch.
-    list of Patch
-    float
-        `Faces.area_change` of the mesh, in 2D of its polygons.
+    Results:
+    - Faces: the cells as polyhedra. The faces of the patches follow those between two cells, patch by patch.
+    - list of Patch
+    - float: `Faces.area_change` of the mesh, in 2D of its polygons.
 
-    Raises
-    ------
-    InputError, InputTypeError
-        If `patches` names walls that do not exist, or a wall twice; if `types` names a patch or type that does not
-        exist; if `thickness` is not positive, or given in 3D; if a name is that of a cyclic or empty patch; for a cell
-        around an island, as a face of OpenFOAM has no hole; or if OpenFOAM rejects the mesh: says where.
+    Raises `InputError` or `InputTypeError` if `patches` names walls that do not exist, or a wall twice; if `types`
+    names a patch or type that does not exist; if `thickness` is not positive, or given in 3D; if a name is that of a
+    cyclic or empty patch; for a cell around an island, as a face of OpenFOAM has no hole; or if OpenFOAM rejects the
+    mesh: says where.
     """
     domain = diagram.domain
     parts = domain.boundaries if patches is None else domain.boundaries.renamed("patches", patches)
@@ -169,10 +157,7 @@ def default_type(name: str) -> PatchType:
 def patch_types(names: tuple[str, ...], types: Mapping[str, PatchType] | None) -> list[PatchType]:
     """Return the type of each patch: that of `types`, else that of its name.
 
-    Raises
-    ------
-    InputError, InputTypeError
-        If `types` names a patch or a type that does not exist.
+    Raises `InputError` or `InputTypeError` if `types` names a patch or a type that does not exist.
     """
     known = get_args(PatchType)
     given = {} if types is None else types
@@ -224,20 +209,15 @@ def write_foam(
 ) -> None:
     """Write a polyMesh. With `processors` write a decomposed case, too: a polyMesh for each processor.
 
-    Parameters
-    ----------
-    path : Path
-        The folder ``.../constant/polyMesh``, which is created if it does not exist; its five files are replaced, others
-        are left. Or ``CASE/name.foam``, an empty file that ParaView opens, with the mesh in ``CASE/constant/polyMesh``.
-    patches, types, thickness, walls, check : optional
-        See `poly_mesh`. The note in the file `points` says by how much straight walls change the area.
-    binary : bool, optional
-        Write numbers as bytes: labels of 32 bits and scalars of 64.
-    zones : mapping, optional
-        Zones of cells by name, one bool per cell each; see `MeshOutput.to_openfoam`. Without zones the files of those
-        of an earlier mesh are removed.
-    processors : int or (n,) array of int, optional
-        See `MeshOutput.to_openfoam`.
+    - `path`: the folder ``.../constant/polyMesh``, which is created if it does not exist; its five files are replaced,
+      others are left. Or ``CASE/name.foam``, an empty file that ParaView opens, with the mesh in
+      ``CASE/constant/polyMesh``.
+    - `patches`, `types`, `thickness`, `walls`, `check`: see `poly_mesh`. The note in the file `points` says by how much
+      straight walls change the area.
+    - `binary`: write numbers as bytes: labels of 32 bits and scalars of 64.
+    - `zones`: zones of cells by name, one bool per cell each; see `MeshOutput.to_openfoam`. Without zones the files of
+      those of an earlier mesh are removed.
+    - `processors` int or (n,) array of int: see `MeshOutput.to_openfoam`.
     """
     contents.diagram.domain.require_flat(
         f"cannot write {path}: OpenFOAM's cells are polyhedra", "save as .nc with convention='mpas', or as .vtu"

@@ -99,10 +99,8 @@ class FoamPiece:
 def processors_of(processors: object, centers: np.ndarray) -> np.ndarray:
     """Return the processor of each cell with these `centers` (n, d), (n,) int.
 
-    Raises
-    ------
-    InputError, InputTypeError
-        If `processors` is not a number from 1 to n, or one number from 0 on for each cell, all of them used.
+    Raises `InputError` or `InputTypeError` if `processors` is not a number from 1 to n, or one number from 0 on for
+    each cell, all of them used.
     """
     n = len(centers)
     given = np.asarray(processors)

@@ -66,10 +66,7 @@ def count_cells(
 ) -> int:
     """Return the number of cells of a mesh.
 
-    Raises
-    ------
-    FileError
-        If its lists do not fit each other.
+    Raises `FileError` if its lists do not fit each other.
     """
     f, inner = len(starts) - 1, len(neighbor)
     n = int(max(owner.max(initial=-1), neighbor.max(initial=-1))) + 1
@@ -145,14 +142,10 @@ def _box(lower: np.ndarray, upper: np.ndarray, periodic: np.ndarray | None = Non
 def read_with_head(path: Path) -> tuple[dict[str, str], bytes, int]:
     """Read a file of OpenFOAM, compressed if it ends in ``.gz``.
 
-    Returns
-    -------
-    head : dict
-        The entries of its head FoamFile.
-    text : bytes
-        The whole file.
-    begin : int
-        Where the head ends in it; 0 if it has none.
+    Results:
+    - `head`: the entries of its head FoamFile.
+    - `text`: the whole file.
+    - `begin`: where the head ends in it; 0 if it has none.
     """
     with open_plain(path) as file:
         text = gzip.decompress(file.read()) if path.suffix == ".gz" else file.read()
@@ -290,9 +283,7 @@ class FoamFile:
 def refuse_polymesh(path: str | PathLike[str]) -> None:
     """Raise an error if `path` is OpenFOAM's mesh, which can be checked and not loaded.
 
-    Raises
-    ------
-    InputError
+    Raises `InputError`.
     """
     if polymesh_folder(path) is not None:
         raise InputError(

@@ -36,15 +36,9 @@ class _Variable:
 class NetCDF:
     """The contents of a file, which `write` writes.
 
-    Parameters
-    ----------
-    path : Path
-    contents : Contents
-        Its settings become an attribute, its extra data variables by `add_extra`.
-    dimensions : mapping
-        Lengths by name.
-    attributes : mapping
-        Attributes of the file: texts and numbers of NumPy.
+    - `contents`: its settings become an attribute, its extra data variables by `add_extra`.
+    - `dimensions`: lengths by name.
+    - `attributes`: attributes of the file: texts and numbers of NumPy.
     """
 
     def __init__(
@@ -77,10 +71,7 @@ class NetCDF:
     def add_extra(self, cells: str, **attributes: str) -> None:
         """Add the caller's data along the dimension `cells`.
 
-        Raises
-        ------
-        InputError
-            If the file has another variable of that name, or the data are too large for the format.
+        Raises `InputError` if the file has another variable of that name, or the data are too large for the format.
         """
         for name, values in self.extra.items():
             if name in self._variables:

@@ -390,10 +390,7 @@ _READERS = {2: _cell_polygons, 3: _cell_polyhedra}
 def _check_repeated(arrays: Mapping[str, np.ndarray], diagram: Diagram) -> None:
     """Check the `arrays` of a file that are not needed to make its `diagram` against that diagram.
 
-    Raises
-    ------
-    FileError
-        Names the first array that differs.
+    Raises `FileError` that names the first array that differs.
     """
     kind = KINDS[diagram.domain.cell_dim]
     expected = {f"Cells.{name}": values for name, values in kind.topology(diagram).items()}

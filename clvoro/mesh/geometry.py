@@ -50,11 +50,8 @@ def face_vectors(points: np.ndarray, starts: np.ndarray, corners: np.ndarray) ->
 def face_geometry(points: np.ndarray, starts: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return centers and area vectors of faces, (f, 3) each.
 
-    Parameters
-    ----------
-    points : (v, 3) float
-    starts : (f + 1,) int, corners : int
-        Corners of each face, at least three.
+    - `points`: (v, 3) float
+    - `starts` (f + 1,) int, corners : int: corners of each face, at least three.
     """
     f = len(starts) - 1
     centers, areas = np.empty((2, f, 3))
@@ -89,13 +86,9 @@ def cell_geometry(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return centroids (n, 3) and volumes (n,) of cells.
 
-    Parameters
-    ----------
-    centers, areas : (f, 3) float
-    owner : (f,) int
-    neighbor : (k,) int
-        Cells behind the first k faces; no other face has a cell behind it.
-    cells : int
+    - `centers`, `areas`: (f, 3) float
+    - `owner`: (f,) int
+    - `neighbor` (k,) int: cells behind the first k faces; no other face has a cell behind it.
     """
     cell, k = np.concatenate([owner, neighbor]), len(neighbor)
 
@@ -112,14 +105,9 @@ def pyramid_sums(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return centroids (3, n) and volumes (n,) of cells from their faces.
 
-    Parameters
-    ----------
-    sides : callable
-        Called with an axis. Returns that component of the centers of the faces, and of their outward areas, (k,) each.
-        One axis at a time takes less memory.
-    cell : (k,) int
-        The cell of each face.
-    cells : int
+    - `sides`: called with an axis. Returns that component of the centers of the faces, and of their outward areas, (k,)
+      each. One axis at a time takes less memory.
+    - `cell` (k,) int: the cell of each face.
     """
     counts = np.maximum(np.bincount(cell, minlength=cells), 1)
     means, moments = np.empty((2, 3, cells))
@@ -158,11 +146,8 @@ def polygon_areas(mesh: Faces) -> np.ndarray:
 def turns(corners: np.ndarray, after: np.ndarray) -> np.ndarray:
     """Return the angle by which polygons turn to the left in each corner, (k,), -pi to pi.
 
-    Parameters
-    ----------
-    corners : (k, 2) float
-    after : (k,) int
-        Place of the next corner of the same polygon.
+    - `corners`: (k, 2) float
+    - `after` (k,) int: place of the next corner of the same polygon.
     """
     ahead = corners[after] - corners
     behind = np.empty_like(ahead)

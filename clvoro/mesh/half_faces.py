@@ -176,10 +176,7 @@ class HalfFaceArrays:
     def edges(self, glued: bool) -> HalfEdges:
         """Return the half-edges in 2D. With `glued`, those at the seams of a periodic box have twins across.
 
-        Raises
-        ------
-        ClvoroError
-            If a face exists on one side only.
+        Raises `ClvoroError` if a face exists on one side only.
         """
         d, ends = self.diagram, self.ends
         rows = np.flatnonzero(ends[:, 0] != ends[:, 1])

@@ -29,13 +29,9 @@ NO_AREA = 1e-14
 class LeftOut(Sealed):
     """Parts of the domain that a mesh for solvers leaves out, and parts of its outside that cells cover.
 
-    Attributes
-    ----------
-    measures : (k,) float64
-        Areas in 2D, volumes in 3D: positive for bays, dead ends and other parts without a cell, negative for land that
-        is covered, such as an island within a cell. The largest ones come first.
-    places : (k, d) float64
-        A point in each.
+    - `measures` (k,) float64: areas in 2D, volumes in 3D: positive for bays, dead ends and other parts without a cell,
+      negative for land that is covered, such as an island within a cell. The largest ones come first.
+    - `places` (k, d) float64: a point in each.
     """
 
     measures: np.ndarray

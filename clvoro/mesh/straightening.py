@@ -137,14 +137,9 @@ def choose_corners(chain: np.ndarray, chosen: np.ndarray, size: np.ndarray) -> N
     As in the algorithm of Douglas and Peucker the point farthest from a straight side divides it, if it is far enough
     outside, and the domain fills the triangle; then both halves are treated alike.
 
-    Parameters
-    ----------
-    chain : (k, 2) float64
-        Points along the boundary, the domain on the left, one chain after the other.
-    chosen : (k,) bool
-        Changed in place. The first and the last point of each chain are chosen.
-    size : (k,) float64
-        Size of the cell of each point.
+    - `chain` (k, 2) float64: points along the boundary, the domain on the left, one chain after the other.
+    - `chosen` (k,) bool: changed in place. The first and the last point of each chain are chosen.
+    - `size` (k,) float64: size of the cell of each point.
     """
     ends = np.flatnonzero(chosen)
     low, high = ends[:-1], ends[1:]

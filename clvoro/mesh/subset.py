@@ -46,10 +46,7 @@ def take_subset(mesh: Mesh, keep: object, boundary: str | np.ndarray) -> Mesh:
 def _within(shape: Domain | Surface, diagram: Diagram) -> np.ndarray:
     """Return which generators of `diagram` lie inside of `shape`, (n,) bool.
 
-    Raises
-    ------
-    InputError
-        If it has another dimension than the mesh.
+    Raises `InputError` if it has another dimension than the mesh.
     """
     domain = diagram.domain
     if shape.dim != domain.dim:
@@ -102,10 +99,7 @@ def without_holes(mesh: Result) -> Result:
 def check_mask(name: str, mask: object, n: int) -> np.ndarray:
     """Return `mask` as an array of n bool.
 
-    Raises
-    ------
-    InputError, InputTypeError
-        If it has another length or shape, or other values.
+    Raises `InputError` or `InputTypeError` if it has another length or shape, or other values.
     """
     array = np.asarray(mask)
     if array.dtype != bool:

@@ -21,10 +21,7 @@ PATIENCE = 0.5
 class BuildNotice:
     """A line on the terminal while kernels are built; it is cleared before anything else is printed.
 
-    Parameters
-    ----------
-    total : int
-        Kernels that the run will need.
+    - `total`: kernels that the run will need.
     """
 
     def __init__(self, total: int) -> None:
@@ -60,19 +57,11 @@ def report_builds(
 ) -> Iterator[BuildNotice | None]:
     """Let workers build kernels of a first run, and report the progress inside the ``with`` block.
 
-    Parameters
-    ----------
-    engine : Engine
-    on_build : callable or None
-        Called with the number of kernels built and of all. With None, the standard error shows a line if it is a
-        terminal.
-    job : str
-        What is done in place of a run: "transport".
+    - `on_build`: called with the number of kernels built and of all. With None, the standard error shows a line if it
+      is a terminal.
+    - `job`: what is done in place of a run: "transport".
 
-    Yields
-    ------
-    BuildNotice or None
-        The line, if there is one.
+    Return the line, if there is one.
     """
     total, notice = build_ahead(engine, job), None
     if total and on_build is None and sys.stderr is not None and sys.stderr.isatty():

@@ -143,10 +143,8 @@ def contexts_of(
 ) -> list[cl.Context]:
     """Return a context on each of `devices`. A name that is given several times stands for equally good ones in turn.
 
-    Raises
-    ------
-    DeviceError, InputError, InputTypeError
-        If one of them does not work, or does not compute in `real`; if two are the same, unless they `may_share` it.
+    Raises `DeviceError`, `InputError` or `InputTypeError` if one of them does not work, or does not compute in `real`;
+    if two are the same, unless they `may_share` it.
     """
     if isinstance(devices, str) or not isinstance(devices, Sequence) or not devices:
         raise InputTypeError(
@@ -232,10 +230,7 @@ def pci_address(device: cl.Device) -> str:
 def refuse_shared_gpus(peers: Peers, device: cl.Device) -> None:
     """Raise if two parts have one GPU. All parts call this together.
 
-    Raises
-    ------
-    InputError
-        On all parts. A GPU whose driver gives no PCI address is not refused.
+    Raises `InputError` on all parts. A GPU whose driver gives no PCI address is not refused.
     """
     address = pci_address(device) if device.type & cl.device_type.GPU else ""
     places = peers.gather_text(f"{address} of {socket.gethostname()}" if address else "")
@@ -334,10 +329,7 @@ def format_devices(devices: Sequence[DeviceInfo]) -> str:
 def require_fp64(where: cl.Context | cl.Device, dtype: DTypeLike = np.float64) -> None:
     """Check that a context's first device (or a device) computes in `dtype`.
 
-    Raises
-    ------
-    DeviceError
-        If `dtype` is float64 and the device has no double precision.
+    Raises `DeviceError` if `dtype` is float64 and the device has no double precision.
     """
     if np.dtype(dtype) != np.float64:
         return

@@ -76,29 +76,16 @@ class PartialSums(NamedTuple):
 class Engine:
     """A device with a queue, a dimension and a precision.
 
-    Parameters
-    ----------
-    ctx : pyopencl.Context
-    queue : pyopencl.CommandQueue
-        In order.
-    dim : 2 or 3
-    real : numpy.dtype
-        float64 or float32.
-    traits : Traits
-        For what kernels are built.
-    workspace : Workspace, optional
-        Memory that stages use in turn; see `scratch`.
-    pool : KernelPool, optional
-        Kernels that stages take.
-    peers : Peers
-        The parts of the domain. The stages work on one of them.
+    - `queue`: in order.
+    - `real`: float64 or float32.
+    - `traits`: for what kernels are built.
+    - `workspace`: memory that stages use in turn; see `scratch`.
+    - `pool`: kernels that stages take.
+    - `peers`: the parts of the domain. The stages work on one of them.
 
-    Attributes
-    ----------
-    groups, group_size : int
-        See `GroupSizes`.
-    period_args : tuple of arrays
-        PERIOD_ARGS of kernels: the periods, padded to four numbers, or nothing.
+    Its attributes:
+    - `groups`, `group_size`: see `GroupSizes`.
+    - `period_args`: PERIOD_ARGS of kernels: the periods, padded to four numbers, or nothing.
     """
 
     def __init__(
@@ -205,17 +192,11 @@ class Engine:
     ) -> Kernels:
         """Return the kernels of `cl_kernels/<stage>.cl`; see `Kernels`.
 
-        Parameters
-        ----------
-        stage : str
-        defines : dict, optional
-            Macros besides those of the engine.
-        prelude : str
-            OpenCL C before the file.
-        group_size : int, optional
-            Work-items per group of block-wise kernels, by default the engine's.
-        shared : bool
-            Return the same kernels in each call with this `stage` and these `defines`. Launches must set all arguments.
+        - `defines`: macros besides those of the engine.
+        - `prelude`: OpenCL C before the file.
+        - `group_size`: work-items per group of block-wise kernels, by default the engine's.
+        - `shared`: return the same kernels in each call with this `stage` and these `defines`. Launches must set all
+          arguments.
         """
         if shared:
             key = stage, frozenset((defines or {}).items())

@@ -35,10 +35,7 @@ class Watcher(Protocol):
 class Tally:
     """A watcher that counts commands.
 
-    Attributes
-    ----------
-    calls, bytes : Counter of (str, str)
-        Number of commands, and their bytes if known, per stage and kernel.
+    - `calls`, `bytes` Counter of (str, str): number of commands, and their bytes if known, per stage and kernel.
     """
 
     def __init__(self) -> None:

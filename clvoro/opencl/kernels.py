@@ -96,16 +96,10 @@ class Kernels(SimpleNamespace):
     Each kernel keeps its own arguments. Its attribute `stage` is the name of the program, for profiles, and `block` the
     number of work-items per group for which it has been built (GROUP_SIZE, see opencl/blocks.h).
 
-    Parameters
-    ----------
-    build : callable
-        Builds the program for a number of work-items per group.
-    stage : str
-        Name of the program.
-    pool : KernelPool
-    group_size : int
-        Work-items per group of block-wise kernels. For a kernel that cannot be launched in such groups, the program is
-        built again for smaller ones.
+    - `build`: builds the program for a number of work-items per group.
+    - `stage`: name of the program.
+    - `group_size`: work-items per group of block-wise kernels. For a kernel that cannot be launched in such groups, the
+      program is built again for smaller ones.
     """
 
     def __init__(self, build: Callable[[int], cl.Program], stage: str, pool: KernelPool, group_size: int = 1) -> None:

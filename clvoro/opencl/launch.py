@@ -44,14 +44,8 @@ def one_group_limit(engine: Engine) -> int:
 class Launch:
     """A block-wise kernel with its arguments set. A call only enqueues it.
 
-    Parameters
-    ----------
-    engine : Engine
-    kernel : pyopencl.Kernel
-    *args
-        Arguments of the kernel.
-    groups : int, optional
-        Number of work-groups, by default the engine's.
+    - `*args`: arguments of the kernel.
+    - `groups`: number of work-groups, by default the engine's.
     """
 
     def __init__(self, engine: Engine, kernel: cl.Kernel, *args: object, groups: int | None = None) -> None:

@@ -34,10 +34,7 @@ def in_bytes(amount: float) -> str:
 def memory_limit() -> float:
     """Return the bytes that `VARIABLE` lets this process take of each device; infinite if it is not set.
 
-    Raises
-    ------
-    InputError
-        If it is no number of bytes.
+    Raises `InputError` if it is no number of bytes.
     """
     text = os.environ.get(VARIABLE, "").strip()
     found = re.fullmatch(r"(\d+\.?\d*) *([KMGT]?)(i?B)?", text, re.IGNORECASE)
@@ -70,10 +67,8 @@ class _CountedBuffer(cl.Buffer):
 def new_buffer(queue: cl.CommandQueue, size: int) -> cl.Buffer:
     """Return a buffer of `size` bytes with arbitrary content.
 
-    Raises
-    ------
-    MemoryLimitError
-        If the device does not allocate so large a buffer, or this process would take more than `memory_limit`.
+    Raises `MemoryLimitError` if the device does not allocate so large a buffer, or this process would take more than
+    `memory_limit`.
     """
     check_allocation(queue.device, size)
     limit = memory_limit()
@@ -95,10 +90,7 @@ def largest_allocation(device: cl.Device) -> int:
 def check_allocation(device: cl.Device, size: int) -> None:
     """Check that one buffer may have `size` bytes on `device`.
 
-    Raises
-    ------
-    MemoryLimitError
-        With the bytes needed and allowed.
+    Raises `MemoryLimitError` with the bytes needed and allowed.
     """
     most = largest_allocation(device)
     if size > most:

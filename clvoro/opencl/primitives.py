@@ -69,11 +69,7 @@ class Summary(NamedTuple):
 class Summaries:
     """Summaries of named arrays, kept on the device until `read` fetches all of them in one transfer.
 
-    Parameters
-    ----------
-    engine : Engine
-    names : sequence of str
-        One slot each; at most 31.
+    - `names`: one slot each; at most 31.
     """
 
     def __init__(self, engine: Engine, names: Sequence[str]) -> None:
@@ -220,11 +216,7 @@ def _words_of(array: cla.Array) -> np.int32:
 class NamedArrays:
     """Device arrays by name, which are kept and grow when needed.
 
-    Parameters
-    ----------
-    engine : Engine
-    spare : float
-        Additional room of a new array, as a share of its size.
+    - `spare`: additional room of a new array, as a share of its size.
     """
 
     def __init__(self, engine: Engine, spare: float = 0.0) -> None:

@@ -75,9 +75,7 @@ _process: int | None = None
 def check_process() -> None:
     """Raise if this process was forked from one that uses OpenCL: calls hang without its threads.
 
-    Raises
-    ------
-    DeviceError
+    Raises `DeviceError`.
     """
     global _process
     if _process is None:
@@ -139,10 +137,7 @@ def crashing_platforms(timeout: float = 300.0) -> dict[int, str]:
 
     For example, PoCL calls `abort` if it cannot read `/sys` or finds too little memory.
 
-    Returns
-    -------
-    dict
-        Reason by the platform's index; empty if no child process can be started.
+    Reasons are by the platform's index; the result is empty if no child process can be started.
     """
     crashed: dict[int, str] = {}
     search = os.pathsep.join([str(Path(__file__).parents[2]), os.environ.get("PYTHONPATH", "")])

@@ -78,10 +78,7 @@ def _paste(name: str, seen: set[str]) -> str:
 def build_program(ctx: cl.Context, name: str, defines: Mapping[str, object], prelude: str) -> cl.Program:
     """Build `cl_kernels/<name>` after `prelude`; the same text on the same context is built once.
 
-    Raises
-    ------
-    BuildError
-        With the compiler's log, if the source does not compile.
+    Raises `BuildError` with the compiler's log, if the source does not compile.
     """
     try:
         return _build_once(ctx, *program_text(name, defines, prelude))

@@ -54,10 +54,7 @@ def prepare() -> None:
 def provide_cache() -> Path | None:
     """Point `XDG_CACHE_HOME` to a temporary folder if the user's cache folder cannot be written, or is full.
 
-    Returns
-    -------
-    pathlib.Path or None
-        The temporary folder, if one is needed and can be made. It is removed when this process ends.
+    Return the temporary folder, if one is needed and can be made. It is removed when this process ends.
     """
     if not sys.platform.startswith("linux"):
         return None

@@ -55,16 +55,10 @@ def framed(method: Method) -> Method:
 class _Taken:
     """A node of the tree of arrays. It is one array; its children are the arrays that have been taken right after it.
 
-    Attributes
-    ----------
-    view : DeviceArray or None
-        None at the root, before the first array.
-    buffer : int
-        Number of its buffer.
-    needed : int
-        Bytes of this array and of all that were taken before it and are in use.
-    after : dict
-        The children, by shape and type.
+    - `view`: None at the root, before the first array.
+    - `buffer`: number of its buffer.
+    - `needed`: bytes of this array and of all that were taken before it and are in use.
+    - `after`: the children, by shape and type.
     """
 
     __slots__ = ("after", "buffer", "needed", "view")

@@ -42,14 +42,10 @@ def transfer_values(
 ) -> tuple[np.ndarray, np.ndarray, int]:
     """Transfer `values` of the cells of `old` to the cells of `new`; see `Diagram.transfer`.
 
-    Returns
-    -------
-    values : (n_new,) or (n_new, k) float64
-        NaN where old cells cover nothing, unless the meshes have one domain.
-    covered : (n_new,) float64
-        The covered share of each new cell; see `Diagram.transfer`.
-    missing : int
-        Number of cells that are not covered, or only in part; 0 if the meshes have one domain.
+    Results:
+    - `values` (n_new,) or (n_new, k) float64: NaN where old cells cover nothing, unless the meshes have one domain.
+    - `covered` (n_new,) float64: the covered share of each new cell; see `Diagram.transfer`.
+    - `missing`: number of cells that are not covered, or only in part; 0 if the meshes have one domain.
     """
     source, target = _diagram("self", old), _diagram("onto", new)
     _require_one_space(source, target)
@@ -229,10 +225,8 @@ def conserved(
     share of the missing mass in proportion to V times the distance of its mean from the upper bound of its data; a
     surplus likewise with the lower bound. No mean leaves its bounds, and constant data stays constant.
 
-    Parameters
-    ----------
-    old_volumes, volumes : (m,), (n,) float64
-    low, high : (n, width) or (width,) float64
+    - `old_volumes`, `volumes`: (m,), (n,) float64
+    - `low`, `high`: (n, width) or (width,) float64
     """
     low, high = (np.broadcast_to(bound, means.shape) for bound in (low, high))
     # The means exceed the bounds by round-off at most.

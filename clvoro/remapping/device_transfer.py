@@ -112,12 +112,8 @@ class CellGraph:
 def transfer_bytes(engine: Engine, old: Pieces, new: Pieces, half_faces: int, width: int, order: int) -> float:
     """Estimate the device memory in bytes that a transfer of `width` columns needs.
 
-    Parameters
-    ----------
-    half_faces : int
-        Those of the old mesh.
-    order : 1 or 2
-        Slopes exist for order 2 only.
+    - `half_faces`: those of the old mesh.
+    - `order`: slopes exist for order 2 only.
     """
     d, real = engine.dim, engine.real.itemsize
     pieces = sum((len(p.points) + len(p)) * d * real + 4 * len(p.items) for p in (old, new))
@@ -150,10 +146,7 @@ class ConservativeTransfer:
     def _are_large(self, status: np.ndarray, cells: np.ndarray, what: str) -> np.ndarray:
         """Return the rows of `status` that need more faces, after the capacity is doubled for them.
 
-        Raises
-        ------
-        ClvoroError, InputError
-            If a piece has too many faces, or is none.
+        Raises `ClvoroError` or `InputError` if a piece has too many faces, or is none.
         """
         failed = np.flatnonzero(status == FAILED)
         if failed.size:
@@ -193,10 +186,7 @@ class ConservativeTransfer:
     def fit_slopes(self, old: PieceArrays, graph: CellGraph, data: CellData, limited: bool) -> CellData:
         """Fit a linear function in each cell to the means of the cell and its neighbors.
 
-        Parameters
-        ----------
-        limited : bool
-            Limit the slopes, so that the function stays within the values of the cell and its neighbors.
+        - `limited`: limit the slopes, so that the function stays within the values of the cell and its neighbors.
         """
         engine, (n, width) = self.engine, data.values.shape
         slopes = engine.empty((n, width, engine.dim))
@@ -237,18 +227,12 @@ class ConservativeTransfer:
     ) -> tuple[np.ndarray, ...]:
         """Return integrals of `data` over the new pieces, bounds of the data there, and volumes.
 
-        Parameters
-        ----------
-        boxes : PieceMeasures
-            Those of the old pieces.
-        periods : (d,) float64
-            By which the old mesh is repeated; 0 where it is not.
+        - `boxes`: those of the old pieces.
+        - `periods` (d,) float64: by which the old mesh is repeated; 0 where it is not.
 
-        Returns
-        -------
-        masses, low, high : (k, width) real
-        volumes, covered : (k,) real
-            Those of the pieces, and what old pieces cover of them.
+        Results:
+        - `masses`, `low`, `high`: (k, width) real
+        - `volumes`, `covered` (k,) real: those of the pieces, and what old pieces cover of them.
         """
         engine, (k, width) = self.engine, (len(new.pieces), data.values.shape[1])
         entries, shifts = (

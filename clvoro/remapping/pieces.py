@@ -27,17 +27,13 @@ class Pieces:
 
     A convex cell with plane faces is one piece. Other cells are divided into triangles, in 3D into pyramids.
 
-    Attributes
-    ----------
-    cells : (k,) int
-        The cell that each piece is a part of, ascending.
-    origins : (k, d) float64
-        A point near each piece, and in it in 3D: the generator, unless it is on a wall or outside of its cell.
-    points : (v, d) float64
-        In 2D and on a sphere corners of cells; in 3D generators, and mirror images of origins in walls and other faces.
-    starts, items : (k + 1,), (m,) int
-        Row i lists those of `points` that bound piece i: its corners, counter-clockwise; in 3D the piece is nowhere
-        nearer to one of them than to its origin.
+    - `cells` (k,) int: the cell that each piece is a part of, ascending.
+    - `origins` (k, d) float64: a point near each piece, and in it in 3D: the generator, unless it is on a wall or
+      outside of its cell.
+    - `points` (v, d) float64: in 2D and on a sphere corners of cells; in 3D generators, and mirror images of origins in
+      walls and other faces.
+    - `starts`, `items` (k + 1,), (m,) int: row i lists those of `points` that bound piece i: its corners,
+      counter-clockwise; in 3D the piece is nowhere nearer to one of them than to its origin.
     """
 
     cells: np.ndarray

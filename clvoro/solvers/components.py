@@ -18,10 +18,7 @@ if TYPE_CHECKING:
 class Components:
     """The components of the diagram `t`, which may be a part of the whole. The work is done on the host.
 
-    Attributes
-    ----------
-    of_cell : (n,) int
-        Number of the component of each cell, the same in all parts.
+    - `of_cell` (n,) int: number of the component of each cell, the same in all parts.
     """
 
     def __init__(self, engine: Engine, t: Tessellation) -> None:
@@ -60,11 +57,8 @@ def balance_components(engine: Engine, domain: Domain, t: Tessellation, source: 
     The right side is source_i = weight_i (s_i - mean s). The null space of the operator has one constant per component.
     Nothing is done if the domain has one piece.
 
-    Parameters
-    ----------
-    source : (n,) real, device
-        Right side, changed in place. It may be longer than n.
-    weights : (n,) real, device
+    - `source` (n,) real, device: right side, changed in place. It may be longer than n.
+    - `weights`: (n,) real, device
     """
     if domain.n_pieces == 1:
         return
@@ -97,11 +91,9 @@ def connected_components(starts: np.ndarray, neighbors: np.ndarray) -> np.ndarra
     The positions of the generators are not sufficient for that: a generator in a corner that several pieces share lies
     in all of them, and a piece without a generator consists of parts of cells and connects them.
 
-    Parameters
-    ----------
-    starts : (n + 1,) int32
-    neighbors : (m,) int32
-        Of cell i from ``starts[i]`` on; negative for walls, n or more for ghosts. The array may be longer.
+    - `starts`: (n + 1,) int32
+    - `neighbors` (m,) int32: of cell i from ``starts[i]`` on; negative for walls, n or more for ghosts. The array may
+      be longer.
     """
     n, other = len(starts) - 1, neighbors[: starts[-1]]
     other = np.where((other < 0) | (other >= n), np.repeat(np.arange(n, dtype=other.dtype), np.diff(starts)), other)

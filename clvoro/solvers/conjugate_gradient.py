@@ -70,26 +70,15 @@ class ConjugateGradient:
     ) -> Solution:
         """Solve A x = b from the start `x`, in place.
 
-        Parameters
-        ----------
-        operator : Operator
-        rhs : (n,) real, device
-        x : (n,) real, device
-        precondition : (n,) store or callable (r, u, work)
-            Inverse of a diagonal, or a function that enqueues u = M^-1 r, M symmetric positive definite, all in
-            `store`. It may overwrite `work`.
-        limits : Limits
-        from_zero : bool
-            Start from zero and ignore `x`. This saves an application of the operator.
-        store : numpy.dtype, optional
-            Type of the iteration's vectors: the engine's precision, or float32 for a large tolerance.
+        - `rhs`: (n,) real, device
+        - `x`: (n,) real, device
+        - `precondition` (n,) store or callable (r, u, work): inverse of a diagonal, or a function that enqueues u =
+          M^-1 r, M symmetric positive definite, all in `store`. It may overwrite `work`.
+        - `from_zero`: start from zero and ignore `x`. This saves an application of the operator.
+        - `store`: type of the iteration's vectors: the engine's precision, or float32 for a large tolerance.
 
-        Raises
-        ------
-        SolverError
-            If the right side, the start or the operator is not finite.
-        BreakdownError
-            If the operator or the preconditioner is not positive definite.
+        Raises `SolverError` if the right side, the start or the operator is not finite. Raises `BreakdownError` if the
+        operator or the preconditioner is not positive definite.
         """
         store = self.engine.real if store is None else np.dtype(store)
         if limits.max_iterations > self._record_capacity:

@@ -47,10 +47,7 @@ class Cycle:
     of smoothing from zero; restriction of the defect; prolongation and a step; the last step. On CPUs it takes ten,
     because evaluating values several times costs more there than storing them. All have the same bits.
 
-    Attributes
-    ----------
-    merged : bool
-        Whether a launch does several steps.
+    - `merged`: whether a launch does several steps.
     """
 
     def __init__(self, engine: Engine) -> None:

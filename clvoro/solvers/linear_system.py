@@ -22,20 +22,15 @@ Precondition = Callable[[cla.Array, cla.Array, cla.Array], object]
 class Solution:
     """Outcome of an iterative solve.
 
-    Attributes
-    ----------
-    iterations : int
-    residual : float
-        True relative residual ||b - A x|| / ||b|| (2-norm), evaluated from x at the end. If `Limits.verify` is False,
-        that of the recurrence.
-    residuals : (iterations + 1,) float64
-        Relative residual before each iteration, by the recurrence, and the final one.
-    converged : bool
-        Whether `residual` is within the tolerance.
-    reason : str
-        ``"converged"``, ``"zero right side"``, ``"stagnated"`` (limited by the precision) or ``"max_iterations"``.
-        ``" (Jacobi after ...)"`` follows if the solver changed to Jacobi's preconditioner; iterations and residuals
-        are then those of both.
+    - `iterations`: int
+    - `residual`: True relative residual ||b - A x|| / ||b|| (2-norm), evaluated from x at the end. If `Limits.verify`
+      is False, that of the recurrence.
+    - `residuals` (iterations + 1,) float64: relative residual before each iteration, by the recurrence, and the final
+      one.
+    - `converged`: whether `residual` is within the tolerance.
+    - `reason`: ``"converged"``, ``"zero right side"``, ``"stagnated"`` (limited by the precision) or
+      ``"max_iterations"``. ``" (Jacobi after ...)"`` follows if the solver changed to Jacobi's preconditioner;
+      iterations and residuals are then those of both.
     """
 
     iterations: int
@@ -53,10 +48,7 @@ class Solution:
 class SolutionToRead(Solution):
     """A solution that the host reads when one of its attributes is first used, so that it need not wait before.
 
-    Parameters
-    ----------
-    read : callable
-        Returns the solution. It is called once.
+    - `read`: returns the solution. It is called once.
     """
 
     def __init__(self, read: Callable[[], Solution]) -> None:
@@ -77,10 +69,7 @@ class SolutionToRead(Solution):
 class BreakdownError(SolverError):
     """The operator or the preconditioner is not positive definite, or not finite.
 
-    Attributes
-    ----------
-    residuals : (iterations + 1,) float64
-        As in `Solution`. The iterate is that of the last valid iteration.
+    - `residuals` (iterations + 1,) float64: as in `Solution`. The iterate is that of the last valid iteration.
     """
 
     def __init__(self, message: str, residuals: list[float]) -> None:
@@ -92,21 +81,16 @@ class BreakdownError(SolverError):
 class Operator:
     """A symmetric positive (semi-)definite operator A.
 
-    Attributes
-    ----------
-    apply : callable (x, y)
-        Enqueues y = A x on the engine's queue. y has the dtype of the iteration's vectors, and so has x, except for the
-        start and the solution.
-    writes_curvature : bool
-        `apply` also writes the partial sums of (x, y) to row `CURVATURE` of `ConjugateGradient.partial`.
-    singular : bool
-        The null space of A is the constants: the mean of the right side is removed first, that of x at the end.
-    rows : tuple of device arrays, optional
-        Starts, columns and weights of A, if it is a matrix (see solvers/sparse_rows.h). One work-group then solves
-        systems of few unknowns, if the preconditioner is diagonal. On GPUs an iteration takes a launch less.
-    part : Part, optional
-        If there are other parts, which solve with this one: x then has rows for ghosts, whose values are known when
-        `apply` is called, and sums are those of all parts.
+    - `apply` callable (x, y): enqueues y = A x on the engine's queue. y has the dtype of the iteration's vectors, and
+      so has x, except for the start and the solution.
+    - `writes_curvature`: `apply` also writes the partial sums of (x, y) to row `CURVATURE` of
+      `ConjugateGradient.partial`.
+    - `singular`: the null space of A is the constants: the mean of the right side is removed first, that of x at the
+      end.
+    - `rows`: starts, columns and weights of A, if it is a matrix (see solvers/sparse_rows.h). One work-group then
+      solves systems of few unknowns, if the preconditioner is diagonal. On GPUs an iteration takes a launch less.
+    - `part`: if there are other parts, which solve with this one: x then has rows for ghosts, whose values are known
+      when `apply` is called, and sums are those of all parts.
     """
 
     apply: Apply
@@ -120,16 +104,11 @@ class Operator:
 class Limits:
     """When an iteration ends.
 
-    Attributes
-    ----------
-    tolerance : float
-        Relative residual in the 2-norm.
-    max_iterations : int
-    lookahead : int
-        Iterations to enqueue at most before the host reads the record. The first read is after as many as the last
-        solve took, but at least 4, if that is less.
-    verify : bool
-        Evaluate the true residual at the end. Otherwise that of the recurrence is trusted.
+    - `tolerance`: relative residual in the 2-norm.
+    - `max_iterations`: int
+    - `lookahead`: iterations to enqueue at most before the host reads the record. The first read is after as many as
+      the last solve took, but at least 4, if that is less.
+    - `verify`: evaluate the true residual at the end. Otherwise that of the recurrence is trusted.
     """
 
     tolerance: float

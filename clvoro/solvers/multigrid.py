@@ -79,14 +79,10 @@ class Multigrid:
     def set_up(self, starts: cla.Array, columns: cla.Array, weights: cla.Array, ghosts: Ghosts | None = None) -> None:
         """Build the levels for the operator (A x)_i = sum_k w_k (x_i - x_columns[k]).
 
-        Parameters
-        ----------
-        starts : (n + 1,) int32
-        columns : (m,) int32
-        weights : (m,) real
-            Symmetric, >= 0. The arrays must not change while the levels are used.
-        ghosts : Ghosts, optional
-            Owners of the columns from n on. All parts call this and `apply` together.
+        - `starts`: (n + 1,) int32
+        - `columns`: (m,) int32
+        - `weights` (m,) real: symmetric, >= 0. The arrays must not change while the levels are used.
+        - `ghosts`: owners of the columns from n on. All parts call this and `apply` together.
         """
         graph, peers = self._aggregation.scale(Graph(starts, columns, weights, ghosts), 0), self.engine.peers
         self._levels, self._factor, rest = [], None, None
@@ -149,10 +145,7 @@ class Multigrid:
         The cycle stays positive definite with any coarse correction. That of a slightly different graph is nearly as
         good: aggregates stay together, and weights between them change less than those between cells.
 
-        Parameters
-        ----------
-        starts, columns, weights, ghosts
-            As for `set_up`, which has been called for as many cells.
+        - `starts`, `columns`, `weights`, `ghosts`: as for `set_up`, which has been called for as many cells.
         """
         if not self._levels:  # all are gathered
             self.set_up(starts, columns, weights, ghosts)
@@ -174,11 +167,8 @@ class Multigrid:
     def apply(self, r: cla.Array, u: cla.Array, work: cla.Array | None = None) -> None:
         """Enqueue u = M^-1 r: one cycle.
 
-        Parameters
-        ----------
-        r, u : (n,) real or float32
-        work : (n,) of the same, optional
-            Overwritten.
+        - `r`, `u`: (n,) real or float32
+        - `work` (n,) of the same: overwritten.
         """
         if self._rest is not None and not self._levels:
             x = self._room("x", size=len(r))

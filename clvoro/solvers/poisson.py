@@ -144,26 +144,18 @@ class Poisson:
 
         (A phi)_i = sum_j w_ij (phi_i - phi_j), w_ij = rho_ij l_ij / |x_i - x_j|.
 
-        Parameters
-        ----------
-        starts : (n + 1,) int32
-        neighbors : (m,) int32
-            Negative entries are walls.
-        face_measures : (m,) real or single
-        points : (n or more, d) real
-            Generators, and ghosts that neighbors name.
-        density : (n or more,) real, optional
-            rho > 0, that of ghosts as well; rho_ij is the geometric mean. By default rho = 1.
-        tolerance : float
-            Tolerance of the solves to come. From `SINGLE_PRECISION_TOLERANCE` on weights and vectors are in float32.
-        part : Part, optional
-            The part whose rows `neighbors` names, if it has ghosts.
-            If owners are in other parts, `apply` takes x with their values, and all parts call `solve` together.
+        - `starts`: (n + 1,) int32
+        - `neighbors` (m,) int32: negative entries are walls.
+        - `face_measures`: (m,) real or single
+        - `points` (n or more, d) real: generators, and ghosts that neighbors name.
+        - `density` (n or more,) real: rho > 0, that of ghosts as well; rho_ij is the geometric mean. By default rho =
+          1.
+        - `tolerance`: tolerance of the solves to come. From `SINGLE_PRECISION_TOLERANCE` on weights and vectors are in
+          float32.
+        - `part`: the part whose rows `neighbors` names, if it has ghosts. If owners are in other parts, `apply` takes x
+          with their values, and all parts call `solve` together.
 
-        Returns
-        -------
-        Laplacian
-            Its weights are in the workspace and valid to the end of the present frame.
+        Its weights are in the workspace and valid to the end of the present frame.
         """
         engine = self.engine
         n = len(starts) - 1
@@ -203,10 +195,7 @@ class Poisson:
 
         The equation with zero flux through all walls has solutions only for such right sides.
 
-        Parameters
-        ----------
-        source, volumes, rhs : (n,) real
-            s, V and the result, which is also returned.
+        - `source`, `volumes`, `rhs` (n,) real: s, V and the result, which is also returned.
         """
         size = np.int32(len(rhs))
         # These kernels are the same for both precisions of the weights, which are mostly single.
@@ -259,38 +248,24 @@ class Poisson:
     ) -> Solution:
         """Solve A phi = b, the paper's (3.2) integrated over the cells; phi has mean zero.
 
-        Parameters
-        ----------
-        laplacian : Laplacian
-        rhs : (n,) real
-            Its mean is removed, because the null space of A is the constants; see `subtract_mean_source`.
-        potential : (n,) real
-            Start on entry (zeros, or the solution of the last step), phi on return.
-        tolerance : float
-            Relative residual. float32 reaches about 1e-5, less on large meshes with a smooth right side: the solve
-            then ends as ``"stagnated"`` with the residual that it reached.
-        max_iterations : int, optional
-        preconditioner : ``"auto"``, ``"jacobi"`` or ``"multigrid"``
-            Multigrid takes 15 to 22 iterations for any size; its set-up costs about as much as ten. ``"auto"`` takes
-            the cheaper one by `expected_costs`: on CPUs, at tolerances of 1e-8 and 1e-2, multigrid from about 2000 and
-            3400 cells on in 2D, from 18,000 and 56,000 in 3D. If multigrid breaks down, stagnates early, or does not
-            converge in 200 iterations without `max_iterations`, Jacobi's preconditioner continues; `Solution.reason`
-            says so.
-        ordering : object, optional
-            The same object as in an earlier call states that the cells are the same, in the same order, and have moved
-            little. The coarse levels of the multigrid are then reused.
-        from_zero : bool
-            Start from zero and ignore `potential`.
-        max_cycles : int, optional
-            Most iterations with multigrid, whatever their residual.
+        - `rhs` (n,) real: its mean is removed, because the null space of A is the constants; see
+          `subtract_mean_source`.
+        - `potential` (n,) real: start on entry (zeros, or the solution of the last step), phi on return.
+        - `tolerance`: relative residual. float32 reaches about 1e-5, less on large meshes with a smooth right side: the
+          solve then ends as ``"stagnated"`` with the residual that it reached.
+        - `preconditioner` ``"auto"``, ``"jacobi"`` or ``"multigrid"``: multigrid takes 15 to 22 iterations for any
+          size; its set-up costs about as much as ten. ``"auto"`` takes the cheaper one by `expected_costs`: on CPUs, at
+          tolerances of 1e-8 and 1e-2, multigrid from about 2000 and 3400 cells on in 2D, from 18,000 and 56,000 in 3D.
+          If multigrid breaks down, stagnates early, or does not converge in 200 iterations without `max_iterations`,
+          Jacobi's preconditioner continues; `Solution.reason` says so.
+        - `ordering`: the same object as in an earlier call states that the cells are the same, in the same order, and
+          have moved little. The coarse levels of the multigrid are then reused.
+        - `from_zero`: start from zero and ignore `potential`.
+        - `max_cycles`: most iterations with multigrid, whatever their residual.
 
-        Raises
-        ------
-        InputError
-            If an argument has the wrong size or value.
-        SolverError
-            If a number is not finite, or the iteration breaks down with Jacobi's preconditioner. If the graph is not
-            connected, the mean of the right side in each part of it is subtracted before a second try.
+        Raises `InputError` if an argument has the wrong size or value. Raises `SolverError` if a number is not finite,
+        or the iteration breaks down with Jacobi's preconditioner. If the graph is not connected, the mean of the right
+        side in each part of it is subtracted before a second try.
         """
         n, part = len(laplacian), laplacian.part
         _check("rhs", rhs, (n,))

@@ -92,18 +92,11 @@ class Transport:
     ) -> tuple[Tessellation, cla.Array, Newton]:
         """Return the power diagram of `points` (n, d) with the `prescribed` volumes (n,), its weights, and the steps.
 
-        Parameters
-        ----------
-        prescribed : (n,) real
-            Changed by a common factor, so that their sum is the volume of the domain; then by one for each component of
-            the diagram, where the domain has several pieces.
-        start : (n,) real, optional
-            Weights to start from, unless they leave a cell empty. By default 0: no cell is empty then.
-        tolerance : float, optional
-            Largest |V - m| / m; by default that of `TOLERANCE`.
-        max_steps : int
-        exact : bool
-            As for `Tessellator.tessellate`.
+        - `prescribed` (n,) real: changed by a common factor, so that their sum is the volume of the domain; then by one
+          for each component of the diagram, where the domain has several pieces.
+        - `start` (n,) real: weights to start from, unless they leave a cell empty. By default 0: no cell is empty then.
+        - `tolerance`: largest |V - m| / m; by default that of `TOLERANCE`.
+        - `exact`: as for `Tessellator.tessellate`.
         """
         engine, n = self.engine, len(prescribed)
         tolerance = TOLERANCE[engine.real.name] if tolerance is None else tolerance

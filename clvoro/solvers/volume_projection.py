@@ -143,30 +143,17 @@ class VolumeProjection:
     ) -> Solution:
         """Write the correction of `displacement` (n, d) to `correction` (n, d).
 
-        Parameters
-        ----------
-        targets : Targets
-        penalty : Penalty
-        limits : Limits
-            The relative residual is that of the recurrence. From `SINGLE_PRECISION_TOLERANCE` on the vectors are in
-            single precision.
-        labels : (n,) int32, optional
-        fixed : int
-            Generators with labels below `fixed` do not move.
-        start : (n,) float32, optional
-            Receives the solution y.
-        warm : bool
-            Start from the content of `start`: the solution of a similar system.
+        - `limits`: the relative residual is that of the recurrence. From `SINGLE_PRECISION_TOLERANCE` on the vectors
+          are in single precision.
+        - `labels`: (n,) int32
+        - `fixed`: generators with labels below `fixed` do not move.
+        - `start` (n,) float32: receives the solution y.
+        - `warm`: start from the content of `start`: the solution of a similar system.
 
-        Returns
-        -------
-        Solution
-            `residual` is that of the recurrence, too.
+        `residual` is that of the recurrence, too.
 
-        Raises
-        ------
-        SolverError
-            If a number is not finite: where cells are few when the solution is first used, with both displacements 0.
+        Raises `SolverError` if a number is not finite: where cells are few when the solution is first used, with both
+        displacements 0.
         """
         unread = None if self._unread is None else self._unread()
         if unread is not None:
@@ -265,10 +252,7 @@ class VolumeProjection:
     def _solution(self, rows: list[list[float]], tolerance: float) -> Solution:
         """Return the outcome by the record.
 
-        Raises
-        ------
-        SolverError
-            If a number is not finite.
+        Raises `SolverError` if a number is not finite.
         """
         iterations = _first_stop(rows)
         flat = bool(iterations and not rows[iterations - 1][RECORD_CURVATURE] > 0)

@@ -64,12 +64,7 @@ def team_defines(warps: bool) -> dict[str, object]:
 class TeamKernel:
     """A kernel whose groups are teams.
 
-    Parameters
-    ----------
-    device : pyopencl.Device
-    kernels : Kernels
-        Those of its program, which is not built yet.
-    name : str
+    - `kernels`: those of its program, which is not built yet.
     """
 
     def __init__(self, device: cl.Device, kernels: Kernels, name: str) -> None:

@@ -37,10 +37,7 @@ def root_edge(extent: np.ndarray, n: int) -> float:
     An axis shorter than the edge has one bin. The edge then follows from the other axes, so that a thin box does not
     get more bins than generators.
 
-    Parameters
-    ----------
-    extent : (d,) float
-    n : int
+    - `extent`: (d,) float
     """
     wide = np.sort(extent)[::-1]
     for axes in range(len(wide), 1, -1):

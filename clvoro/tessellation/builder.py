@@ -87,28 +87,17 @@ class CellBuilder(ABC):
     ) -> Tessellation:
         """Build the cells of `part`.
 
-        Parameters
-        ----------
-        binned : BinnedPoints
-            The generators and ghosts of `part`, sorted into bins.
-        previous : Tessellation or NeighborRows, optional
-            A diagram of the same generators at earlier positions: with `from_previous` clipping starts from its
-            neighbors.
-        exact : bool
-            Reject generators so close together that round-off makes more than `EXACT_SHARE` of a cell uncertain;
-            otherwise more than `ROUGH_SHARE`.
-        rows : int, optional
-            Number of first rows of `part` whose cells are built; by default all, those of ghosts, too. Faces between
-            cells that are built and others are not matched.
+        - `binned`: the generators and ghosts of `part`, sorted into bins.
+        - `previous`: a diagram of the same generators at earlier positions: with `from_previous` clipping starts from
+          its neighbors.
+        - `exact`: reject generators so close together that round-off makes more than `EXACT_SHARE` of a cell uncertain;
+          otherwise more than `ROUGH_SHARE`.
+        - `rows`: number of first rows of `part` whose cells are built; by default all, those of ghosts, too. Faces
+          between cells that are built and others are not matched.
 
-        Raises
-        ------
-        InputError
-            If two generators coincide or are too close for the precision (`CloseError`).
-        MemoryLimitError
-            If the faces are too many for 32-bit indices.
-        ClvoroError
-            If a cell has too many faces.
+        Raises `InputError` if two generators coincide or are too close for the precision (`CloseError`). Raises
+        `MemoryLimitError` if the faces are too many for 32-bit indices. Raises `ClvoroError` if a cell has too many
+        faces.
         """
         t = self._tessellate(part, binned, previous, exact, part.count if rows is None else rows)
         if part.labels is not None and self.knows_corners(t):

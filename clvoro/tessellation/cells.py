@@ -41,18 +41,12 @@ FIRST_REACH = 1.9
 class Cells(CellBuilder):
     """Tessellate a box in 2D, or a sphere. A cell may have about `LARGEST_ROW` faces, or `LARGEST_ELSEWHERE`.
 
-    Parameters
-    ----------
-    engine : Engine
-    folded : bool
-        For the folded diagrams of a periodic box, in which a neighbor is the nearest image of its generator: they are
-        updated, or clipped by `clip_by_rings`. The periods are built into the kernels, which compute corners from
-        differences of positions.
+    - `folded`: for the folded diagrams of a periodic box, in which a neighbor is the nearest image of its generator:
+      they are updated, or clipped by `clip_by_rings`. The periods are built into the kernels, which compute corners
+      from differences of positions.
 
-    Attributes
-    ----------
-    lanes : int
-        Cells that one work-item measures or checks.
+    Its attributes:
+    - `lanes`: cells that one work-item measures or checks.
     """
 
     from_previous = False

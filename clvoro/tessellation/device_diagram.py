@@ -31,10 +31,7 @@ HALF = 85.0
 class OpenCellError(InputError):
     """Generators on a sphere leave a half of it free, or weights are so different that a cell reaches so far.
 
-    Parameters
-    ----------
-    points : (n, 3) ndarray
-        The generators, as unit vectors.
+    - `points` (n, 3) ndarray: the generators, as unit vectors.
     """
 
     def __init__(self, points: np.ndarray) -> None:
@@ -59,19 +56,12 @@ class OpenCellError(InputError):
 class CloseError(InputError):
     """Generators too close to be distinguished. Positions are those of the device until `within` converts them.
 
-    Parameters
-    ----------
-    points : (n or more, d) real, on the device
-        Generators in normalized coordinates.
-    n : int
-        Number of generators.
+    - `points` (n or more, d) real, on the device: generators in normalized coordinates.
+    - `n`: number of generators.
 
-    Attributes
-    ----------
-    place : (d,) float
-        Position of one generator of the closest pair.
-    gap : float
-        Distance of the pair.
+    Its attributes:
+    - `place` (d,) float: position of one generator of the closest pair.
+    - `gap`: distance of the pair.
     """
 
     def __init__(self, points: cla.Array, n: int) -> None:

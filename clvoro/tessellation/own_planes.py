@@ -26,18 +26,12 @@ PLANES_PER_CELL = 1.0
 class SolidBox(ClipBox):
     """The box around a solid, and the planes of walls that cut the cells of generators in it.
 
-    Parameters
-    ----------
-    domain : Domain
-        One with `wall_triangles`.
-    size : callable, optional
-        Target size near points (k, 3), (k,): normals are averaged over it, and planes are moved by the mean height of
-        the surface over it. Without it planes touch the surface.
+    - `domain`: one with `wall_triangles`.
+    - `size`: target size near points (k, 3), (k,): normals are averaged over it, and planes are moved by the mean
+      height of the surface over it. Without it planes touch the surface.
 
-    Attributes
-    ----------
-    plane_count : int
-        Number of planes when they were last counted.
+    Its attributes:
+    - `plane_count`: number of planes when they were last counted.
     """
 
     def __init__(

@@ -118,11 +118,8 @@ class PolyhedraUpdate:
 class _Rounds:
     """The launches of the rounds of one update.
 
-    Attributes
-    ----------
-    cut : CutCells
-    room : int
-        Number of faces that it has room for.
+    - `cut`: CutCells
+    - `room`: number of faces that it has room for.
     """
 
     def __init__(

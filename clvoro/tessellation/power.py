@@ -27,10 +27,7 @@ PROGRESS = 0.95
 class Rings:
     """Generators with weights, and the search for the neighbors of a cell in rings around its neighbors so far.
 
-    Attributes
-    ----------
-    volume : float
-        That of the domain, in normalized coordinates.
+    - `volume`: that of the domain, in normalized coordinates.
     """
 
     def __init__(self, stages: TessellationStages, domain: Domain) -> None:

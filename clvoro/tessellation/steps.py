@@ -34,14 +34,9 @@ Sort: TypeAlias = Callable[[], BinnedPoints]
 class DomainSteps:
     """The steps before and after cells are built, for one domain.
 
-    Attributes
-    ----------
-    box : ClipBox
-        Clips the cells of a finished diagram.
-    most : (1,) int32, device
-        Key of the largest weight, in a power diagram; see geometry/weights.h.
-    halo : Halo or None
-        In a periodic box.
+    - `box`: clips the cells of a finished diagram.
+    - `most` (1,) int32, device: key of the largest weight, in a power diagram; see geometry/weights.h.
+    - `halo`: in a periodic box.
     """
 
     box: ClipBox
@@ -82,12 +77,8 @@ class DomainSteps:
     def builds_all(self, part: Part, complete: bool, enough: bool) -> bool:
         """Return whether ghosts of `part` get cells, too. Ghosts without values always do: something cuts their cells.
 
-        Parameters
-        ----------
-        complete : bool
-            Whether the diagram must be complete, with the cells of images.
-        enough : bool
-            Whether no ghosts are missing. As long as some may be, cells of many images are not built.
+        - `complete`: whether the diagram must be complete, with the cells of images.
+        - `enough`: whether no ghosts are missing. As long as some may be, cells of many images are not built.
         """
         return part.ghosts is None or (complete and (enough or part.count < max(2 * part.n_own, LATER_FROM)))
 
@@ -102,14 +93,9 @@ class DomainSteps:
     def finish(self, part: Part, t: Tessellation, points: cla.Array, exact: bool, nearest: bool) -> Tessellation | None:
         """Return the diagram of the domain from `t`, that of `part`; None if other ghosts are needed.
 
-        Parameters
-        ----------
-        points : (n, d) real
-            Positions of the generators.
-        exact : bool
-            As for `CellBuilder.tessellate`.
-        nearest : bool
-            In a periodic box, reject neighbors that are not the nearest image of their generator.
+        - `points` (n, d) real: positions of the generators.
+        - `exact`: as for `CellBuilder.tessellate`.
+        - `nearest`: in a periodic box, reject neighbors that are not the nearest image of their generator.
         """
         return self.finish_updated(t, points, part.n_own)
 
@@ -145,10 +131,7 @@ class DomainSteps:
 class SolidWalls(DomainSteps):
     """The steps in a solid: cells are cut by planes of their own.
 
-    Parameters
-    ----------
-    size : callable, optional
-        See `SolidBox`.
+    - `size`: see `SolidBox`.
     """
 
     def __init__(

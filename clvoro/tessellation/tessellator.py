@@ -27,28 +27,17 @@ class Tessellator:
 
     Each call overwrites the `Tessellation` of the call before. Its graph stays valid until the new one is complete.
 
-    Parameters
-    ----------
-    spacing : callable, optional
-        Where a boundary cuts cells: distance of generators near points (k, 2) of it, (k,); places ghost generators.
-    coarser : Tessellator, optional
-        The tessellator of a coarser level of the same domain. Its halo is the first guess in a periodic box.
-    weighted : bool
-        Make power diagrams.
-    straight : bool
-        Where a boundary cuts cells: measure cells as the mesh for solvers has them; see `Cut`.
+    - `spacing`: where a boundary cuts cells: distance of generators near points (k, 2) of it, (k,); places ghost
+      generators.
+    - `coarser`: the tessellator of a coarser level of the same domain. Its halo is the first guess in a periodic box.
+    - `weighted`: make power diagrams.
+    - `straight`: where a boundary cuts cells: measure cells as the mesh for solvers has them; see `Cut`.
 
-    Attributes
-    ----------
-    steps : DomainSteps
-        What the domain adds to the steps.
-    rings : Rings or None
-        For power diagrams.
+    Its attributes:
+    - `steps`: what the domain adds to the steps.
+    - `rings`: for power diagrams.
 
-    Raises
-    ------
-    InputError
-        If there are no power diagrams in such a domain.
+    Raises `InputError` if there are no power diagrams in such a domain.
     """
 
     def __init__(
@@ -91,20 +80,14 @@ class Tessellator:
     ) -> Tessellation:
         """Tessellate by the first `n` of `points` (n, d), in normalized coordinates.
 
-        Parameters
-        ----------
-        previous : Tessellation, optional
-            The latest diagram, of the same generators at earlier positions, for an incremental update.
-        exact : bool
-            Reject generators so close that round-off makes a share of a cell uncertain; see `CellBuilder.tessellate`.
-        binned : BinnedPoints, optional
-            The generators in bins, if they are known.
-        follow : callable, optional
-            See `Follow`.
-        complete : bool
-            Make all that `final` needs: in a periodic box the cells of images as well.
-        labels : (n,) int32, optional
-            Permanent names of the generators, which parts of a domain need; a new array for other generators.
+        - `previous`: the latest diagram, of the same generators at earlier positions, for an incremental update.
+        - `exact`: reject generators so close that round-off makes a share of a cell uncertain; see
+          `CellBuilder.tessellate`.
+        - `binned`: the generators in bins, if they are known.
+        - `follow`: see `Follow`.
+        - `complete`: make all that `final` needs: in a periodic box the cells of images as well.
+        - `labels` (n,) int32: permanent names of the generators, which parts of a domain need; a new array for other
+          generators.
         """
 
         @cache
@@ -132,15 +115,10 @@ class Tessellator:
     ) -> Tessellation | None:
         """Return the power diagram of `points` (n, d) with `weights` (n,), in normalized coordinates.
 
-        Parameters
-        ----------
-        previous : NeighborRows, optional
-            The graph of a diagram of similar weights, without empty cells: in 2D and float64 cells start from its
-            neighbors. Far from its generator a cell is found much sooner than by a search around the generator.
-        least : float
-            With `previous`: None is returned as soon as a cell is known to be smaller.
-        exact, complete : bool
-            As for `tessellate`.
+        - `previous`: the graph of a diagram of similar weights, without empty cells: in 2D and float64 cells start from
+          its neighbors. Far from its generator a cell is found much sooner than by a search around the generator.
+        - `least`: with `previous`: None is returned as soon as a cell is known to be smaller.
+        - `exact`, `complete`: as for `tessellate`.
         """
         assert self.rings is not None
         with self._in_units(points, n):

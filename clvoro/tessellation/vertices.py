@@ -39,10 +39,7 @@ class VertexNumbering:
     def number(self, box: ClipBox, t: Tessellation) -> Vertices:
         """Return the vertices of `t`, ordered by the least index of their corners.
 
-        Raises
-        ------
-        ClvoroError
-            If the walk around a vertex does not end.
+        Raises `ClvoroError` if the walk around a vertex does not end.
         """
         engine, k = self.engine, self._kernels
         m = int(t.starts[t.n].get())

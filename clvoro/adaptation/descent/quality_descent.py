@@ -61,20 +61,14 @@ class QualityDescent:
     ) -> None:
         """Write the displacement ``-rate h^2 dE/dx`` to `lloyd` (n, 2), in place of the displacement to the centroid.
 
-        Parameters
-        ----------
-        h, quality : (n,) real
-        quality_weight, bad_cell_weight : float
-            The weight of a cell is omega = quality_weight (1 - bad_cell_weight log Q).
-        rate : float
-            Step length.
-        max_displacement : float
-            Largest displacement over h.
-        edges, pairs : Repulsion
-            Energies of the ends of edges, and of neighboring generators.
-        full_rate : float
-            Largest omega h^2 / A of a cell and its neighbors up to which its generator moves at the full rate; beyond
-            it the rate is smaller in proportion.
+        - `h`, `quality`: (n,) real
+        - `quality_weight`, `bad_cell_weight`: the weight of a cell is omega = quality_weight (1 - bad_cell_weight log
+          Q).
+        - `rate`: step length.
+        - `max_displacement`: largest displacement over h.
+        - `edges`, `pairs`: energies of the ends of edges, and of neighboring generators.
+        - `full_rate`: largest omega h^2 / A of a cell and its neighbors up to which its generator moves at the full
+          rate; beyond it the rate is smaller in proportion.
         """
         engine, k, real = self.engine, self._kernels, self.engine.real.type
         with engine.workspace.frame():

@@ -28,17 +28,11 @@ class SurfaceDescent:
     ) -> None:
         """Write the displacement ``-rate h^2 dE/dx`` to `lloyd` (n, 3), in place of the displacement to the centroid.
 
-        Parameters
-        ----------
-        t : Tessellation
-            With vertices.
-        h, quality : (n,) real
-        bad_cell_weight : float
-            The weight of a cell is omega = 1 - bad_cell_weight log Q.
-        rate : float
-            Step length.
-        max_displacement : float
-            Largest displacement over h.
+        - `t`: with vertices.
+        - `h`, `quality`: (n,) real
+        - `bad_cell_weight`: the weight of a cell is omega = 1 - bad_cell_weight log Q.
+        - `rate`: step length.
+        - `max_displacement`: largest displacement over h.
         """
         engine, k, real = self.engine, self._kernels, self.engine.real.type
         with engine.workspace.frame():

@@ -20,10 +20,7 @@ def lattice_points(domain: Domain, n: int) -> np.ndarray:
     In 2D they are rows of a hexagonal lattice, in 3D layers of a body-centered cubic one. If `n` does not fill all
     rows, some rows have one generator more and are wider in the same ratio, so that the lattice has a dislocation.
 
-    Raises
-    ------
-    InputError
-        If the box is narrower than `FEWEST_ROWS` cells.
+    Raises `InputError` if the box is narrower than `FEWEST_ROWS` cells.
     """
     spacing = (domain.measure / n) ** (1 / domain.dim)
     if domain.extent.min() < FEWEST_ROWS * spacing:

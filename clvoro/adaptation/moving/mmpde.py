@@ -148,22 +148,13 @@ class Mmpde:
 class MmpdeMethod(Method):
     """Descent of Huang's functional, with Nesterov's momentum that restarts when the last step goes uphill.
 
-    Attributes
-    ----------
-    lattice : (n, d) float64
-        The generators at the start, in the order of their labels.
-    tolerance : float
-        Least decrease of the functional over `WINDOW` steps, over that since the start.
-    age : int
-        Steps since the last restart.
-    steps : int
-        Steps done.
-    first, energy : float
-        The functional at the start, and at the begin of the window.
-    finished : bool
-        Whether the functional no longer decreases.
-    warned : int
-        1 after a warning.
+    - `lattice` (n, d) float64: the generators at the start, in the order of their labels.
+    - `tolerance`: least decrease of the functional over `WINDOW` steps, over that since the start.
+    - `age`: steps since the last restart.
+    - `steps`: steps done.
+    - `first`, `energy`: the functional at the start, and at the begin of the window.
+    - `finished`: whether the functional no longer decreases.
+    - `warned`: 1 after a warning.
     """
 
     lattice: np.ndarray = field(repr=False)
@@ -179,10 +170,7 @@ class MmpdeMethod(Method):
     def step(self, mesh: MeshState) -> Displacement:
         """Evaluate the displacement as `lloyd`; the correction is zero.
 
-        Warns
-        -----
-        TangledMeshWarning
-            If simplices have lost their volume.
+        Warns with `TangledMeshWarning` if simplices have lost their volume.
         """
         engine, stage = mesh.engine, mesh.stages.mmpde
         if self.connections is None:

@@ -46,11 +46,8 @@ constant on the right side, and one in phi."""
 class LatticeMap:
     """Maps x = xi + grad phi of a lattice (n, d) in a box.
 
-    Attributes
-    ----------
-    gradient : list of d sparse arrays (n, n)
-    hessian : dict of sparse arrays (n, n)
-        By their two axes, the first one not larger.
+    - `gradient`: list of d sparse arrays (n, n)
+    - `hessian` dict of sparse arrays (n, n): by their two axes, the first one not larger.
     """
 
     def __init__(self, domain: Domain, points: np.ndarray) -> None:

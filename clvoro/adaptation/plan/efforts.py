@@ -25,58 +25,37 @@ class LoosePolish:
 class Effort:
     """Amount of work of a run.
 
-    Attributes
-    ----------
-    start, couple, couple_finest : int
-        Coupled steps on the coarsest level, on the levels between, and on the finest.
-    sweeps : tuple of int
-        Sweeps (insert/delete, then glide) on the finest level, on the next coarser one, and so on. The last number
-        holds for all coarser levels.
-    alone : int
-        Sweeps if there are no coarser levels; in 3D, steps of gliding before the last ones.
-    start_alone : int
-        The most of the steps `start` if there are no coarser levels, in 2D.
-    glide : int
-        Steps of a sweep.
-    polish : int
-        Steps of polishing.
-    error_target : float
-        Mean |log(L / h)| that polishing aims at.
-    steep_error_target : float
-        The same where sizes are steepest (see `choose_error_target`), in 2D. The mean |e| is then at most 0.015.
-    relaxation, momentum : float
-        Parameters of gliding. A heavy ball with momentum m is stable up to a relaxation of 2 (1 + m), as a perfect
-        lattice relaxes by at most the whole displacement per step of Lloyd's.
-    calm_relaxation : float
-        Relaxation of gliding at thin walls; see `CALM_MOMENTUM`.
-    polish_momentum : float
-        Momentum of polishing.
-    penalty : float
-        Initial penalty of polishing.
-    nuclei : float
-        Share of the cells where dislocations may be nucleated, in every third sweep.
-    first : int
-        Largest number of sweeps on the coarsest of several levels.
-    bad_cell_weight, quality_scale, log_ratio_scale : float
-        Parameters of polishing: see `ProjectedMethod`. The last one is relative to the error target.
-    loose_bad_cells : float
-        Largest factor on the weight of bad cells with an error target above the effort's own; up to it the factor is
-        the ratio of the two.
-    largest_log_ratio_scale : float
-        Largest scale of log(L / h) in the penalty, with an error target above the effort's own. It bounds the largest
-        error. The power is 4 then. On the way there the scale grows like the power 1.5 of the target.
-    repairs : tuple of (int, RepairCells)
-        Repairs of the worst cells, each before this step of polishing. Some steps follow the last one.
-    deficit : float
-        1 - mean Q of meshes of this effort in 2D, without walls.
-    coarse_glide, coarse_polish : int
-        In 3D, steps of gliding and of polishing at the end of each coarser level.
-    recouple : int
-        In 3D, coupled steps after each correction of the number of cells on a coarser level.
-    loose : LoosePolish, optional
-        In 2D.
-    separate : int
-        Steps of separating, in 2D.
+    - `start`, `couple`, `couple_finest`: coupled steps on the coarsest level, on the levels between, and on the finest.
+    - `sweeps`: sweeps (insert/delete, then glide) on the finest level, on the next coarser one, and so on. The last
+      number holds for all coarser levels.
+    - `alone`: sweeps if there are no coarser levels; in 3D, steps of gliding before the last ones.
+    - `start_alone`: the most of the steps `start` if there are no coarser levels, in 2D.
+    - `glide`: steps of a sweep.
+    - `polish`: steps of polishing.
+    - `error_target`: mean |log(L / h)| that polishing aims at.
+    - `steep_error_target`: the same where sizes are steepest (see `choose_error_target`), in 2D. The mean |e| is then
+      at most 0.015.
+    - `relaxation`, `momentum`: parameters of gliding. A heavy ball with momentum m is stable up to a relaxation of 2 (1
+      + m), as a perfect lattice relaxes by at most the whole displacement per step of Lloyd's.
+    - `calm_relaxation`: relaxation of gliding at thin walls; see `CALM_MOMENTUM`.
+    - `polish_momentum`: momentum of polishing.
+    - `penalty`: initial penalty of polishing.
+    - `nuclei`: share of the cells where dislocations may be nucleated, in every third sweep.
+    - `first`: largest number of sweeps on the coarsest of several levels.
+    - `bad_cell_weight`, `quality_scale`, `log_ratio_scale`: parameters of polishing: see `ProjectedMethod`. The last
+      one is relative to the error target.
+    - `loose_bad_cells`: largest factor on the weight of bad cells with an error target above the effort's own; up to it
+      the factor is the ratio of the two.
+    - `largest_log_ratio_scale`: largest scale of log(L / h) in the penalty, with an error target above the effort's
+      own. It bounds the largest error. The power is 4 then. On the way there the scale grows like the power 1.5 of the
+      target.
+    - `repairs` tuple of (int, RepairCells): repairs of the worst cells, each before this step of polishing. Some steps
+      follow the last one.
+    - `deficit`: 1 - mean Q of meshes of this effort in 2D, without walls.
+    - `coarse_glide`, `coarse_polish`: in 3D, steps of gliding and of polishing at the end of each coarser level.
+    - `recouple`: in 3D, coupled steps after each correction of the number of cells on a coarser level.
+    - `loose`: in 2D.
+    - `separate`: steps of separating, in 2D.
     """
 
     start: int
@@ -234,14 +213,9 @@ EFFORTS_OF = {2: EFFORTS, 3: EFFORTS_3D}
 def is_near(dim: int, effort: str, n: int, missing: float, mean_error: float, mean_quality: float) -> bool:
     """Return whether a given mesh of `n` cells only needs a correction to reach the quality of `effort`.
 
-    Parameters
-    ----------
-    missing : float
-        Number of missing cells; negative if there are too many.
-    mean_error : float
-        Mean of |e|.
-    mean_quality : float
-        Mean of Q.
+    - `missing`: number of missing cells; negative if there are too many.
+    - `mean_error`: mean of |e|.
+    - `mean_quality`: mean of Q.
     """
     deficit = {2: EFFORTS[effort].deficit + WALL_DEFICIT / math.sqrt(n), 3: DEFICIT_3D}[dim]
     return mean_error <= NEAR_ERROR and abs(missing) <= NEAR_COUNT * n and 1 - mean_quality <= deficit
@@ -250,10 +224,7 @@ def is_near(dim: int, effort: str, n: int, missing: float, mean_error: float, me
 def steep_share(slopes: np.ndarray, cells: np.ndarray) -> float:
     """Return the share of the cells where sizes are steep: 0 up to a slope of `STEEP`, 1 from `STEEPEST` on.
 
-    Parameters
-    ----------
-    slopes, cells : (m,) float
-        |grad h| and the number of cells in each part of the domain.
+    - `slopes`, `cells` (m,) float: |grad h| and the number of cells in each part of the domain.
     """
     steepness = np.clip((slopes - STEEP) / (STEEPEST - STEEP), 0, 1)
     return float(steepness @ cells / cells.sum())
@@ -262,14 +233,9 @@ def steep_share(slopes: np.ndarray, cells: np.ndarray) -> float:
 def choose_error_target(dim: int, effort: str, levels: int, near: bool = False, steep: float = 0.0) -> float:
     """Return the error target of a run for which the caller has given none.
 
-    Parameters
-    ----------
-    levels : int
-        Number of coarser levels.
-    near : bool
-        The run only corrects a given mesh (see `is_near`).
-    steep : float
-        Share of the cells where sizes are steep.
+    - `levels`: number of coarser levels.
+    - `near`: the run only corrects a given mesh (see `is_near`).
+    - `steep`: share of the cells where sizes are steep.
     """
     if dim == 3:
         return EFFORTS_3D[effort].error_target

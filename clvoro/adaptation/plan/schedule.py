@@ -129,27 +129,18 @@ def adaptive_schedule(
 ) -> list[Action]:
     """Return the schedule of the methods "adaptive" and "exact", with `levels` coarser levels.
 
-    Parameters
-    ----------
-    effort : str
-        One of `EFFORTS`.
-    exact : bool
-        End with the exact projection.
-    error_target : float, optional
-        By default that of `choose_error_target` for smooth sizes.
-    begins : "random", "mesh", "partly random" or "near"
-        What the run begins with: random points, a mesh, a mesh in which random points replace some, or a mesh that only
-        needs a correction (see `is_near`), without coarser levels.
-    openings : int
-        How often the last steps open obtuse triangles, at most. Some steps before them cells of four sides are deleted,
-        and those of eight split: a cell of four sides has an obtuse triangle.
-    narrow_parts : bool
-        The domain, in 2D, may have parts that few cells join. The number of cells in each part is then balanced before
-        each refinement, which multiplies what a part lacks, before polishing, and after each repair. The penalty of
-        exact projections falls step by step (see `GRADUAL_PENALTIES`).
-    most : int, optional
-        Largest number of steps from a mesh without coarser levels. Sweeps, and in 3D steps of the first polishing, are
-        left out to meet it. The last steps, which polish, are kept, even if they are more.
+    - `effort`: one of `EFFORTS`.
+    - `exact`: end with the exact projection.
+    - `error_target`: by default that of `choose_error_target` for smooth sizes.
+    - `begins` "random", "mesh", "partly random" or "near": what the run begins with: random points, a mesh, a mesh in
+      which random points replace some, or a mesh that only needs a correction (see `is_near`), without coarser levels.
+    - `openings`: how often the last steps open obtuse triangles, at most. Some steps before them cells of four sides
+      are deleted, and those of eight split: a cell of four sides has an obtuse triangle.
+    - `narrow_parts`: the domain, in 2D, may have parts that few cells join. The number of cells in each part is then
+      balanced before each refinement, which multiplies what a part lacks, before polishing, and after each repair. The
+      penalty of exact projections falls step by step (see `GRADUAL_PENALTIES`).
+    - `most`: largest number of steps from a mesh without coarser levels. Sweeps, and in 3D steps of the first
+      polishing, are left out to meet it. The last steps, which polish, are kept, even if they are more.
     """
     if error_target is None:
         error_target = choose_error_target(dim, effort, levels, begins == "near")

@@ -23,14 +23,11 @@ def hilbert_tables(dim: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     A state is an entry corner e and a direction a. The curve visits the children of a box in
     Gray-code order, turned by a and reflected by e.
 
-    Returns
-    -------
-    place : (states, 2^d, d) int
-        Half of the box, 0 or 1 per axis, of the k-th child on the curve.
-    after : (states, 2^d) int
-        State of that child.
-    rank : (states, 2^d) int
-        The inverse of `place`: k of the child whose halves are the bits of the index (axis 0 is the lowest bit).
+    Results:
+    - `place` (states, 2^d, d) int: half of the box, 0 or 1 per axis, of the k-th child on the curve.
+    - `after` (states, 2^d) int: state of that child.
+    - `rank` (states, 2^d) int: the inverse of `place`: k of the child whose halves are the bits of the index (axis 0 is
+      the lowest bit).
     """
     full, states = 1 << dim, dim << dim
 
@@ -61,18 +58,12 @@ def hilbert_tables(dim: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 class BoxTree:
     """Boxes that tile the domain's bounding box, in the order of a Hilbert curve.
 
-    Attributes
-    ----------
-    corner : (m, d) float
-        Lower corners in units of the edges of the root boxes: multiples of powers of two, hence exact.
-    level : (m,) int8
-        The edges are 2^-level root edges.
-    state : (m,) int8
-        State of the curve in each box.
-    root : (d,) float
-        Physical edges of the root boxes.
-    end : (d,) float
-        Number of root boxes per axis: the upper corner in root units.
+    - `corner` (m, d) float: lower corners in units of the edges of the root boxes: multiples of powers of two, hence
+      exact.
+    - `level` (m,) int8: the edges are 2^-level root edges.
+    - `state` (m,) int8: state of the curve in each box.
+    - `root` (d,) float: physical edges of the root boxes.
+    - `end` (d,) float: number of root boxes per axis: the upper corner in root units.
     """
 
     def __init__(self, domain: Domain):
@@ -157,12 +148,9 @@ class BoxTree:
     def split(self, chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Replace the boxes where `chosen` (m,) is true by their children, in the order of the curve.
 
-        Returns
-        -------
-        parent : (m',) int
-            For each new box, the old index of itself or of its parent.
-        child : (m',) int8
-            Rank among the siblings; -1 for boxes that were not split.
+        Results:
+        - `parent` (m',) int: for each new box, the old index of itself or of its parent.
+        - `child` (m',) int8: rank among the siblings; -1 for boxes that were not split.
         """
         place, after, _ = hilbert_tables(self.dim)
         counts = np.where(chosen, 1 << self.dim, 1)

@@ -34,10 +34,7 @@ def gauss_rule(dim: int) -> tuple[np.ndarray, np.ndarray]:
 class FullCoverage:
     """Boxes that are inside the domain, such as those of a tree over a box.
 
-    Parameters
-    ----------
-    boxes : BoxTree
-        Changed by `split`.
+    - `boxes`: changed by `split`.
     """
 
     correction: np.ndarray | float = 1.0
@@ -88,12 +85,8 @@ class FullCoverage:
 class CutCoverage(FullCoverage):
     """Boxes that the boundary of a domain cuts.
 
-    Attributes
-    ----------
-    share : (m,) float
-        Share of each box's measure inside the domain; exactly 0 or 1 up to slivers.
-    inner : (m, d) float
-        A point in the part of the box inside the domain, for cut boxes.
+    - `share` (m,) float: share of each box's measure inside the domain; exactly 0 or 1 up to slivers.
+    - `inner` (m, d) float: a point in the part of the box inside the domain, for cut boxes.
     """
 
     def __init__(self, boxes: BoxTree, domain: Domain):
@@ -139,12 +132,8 @@ class SolidCoverage(CutCoverage):
     The shares of the parts of a box are scaled so that their sum is that of the box, and those of all boxes to the
     measure of the domain. Boxes that the surface does not meet are examined no more.
 
-    Attributes
-    ----------
-    share : (m,) float
-        Share of each box's volume inside the domain.
-    inner : (m, d) float
-        A point inside the domain and the box, for cut boxes with a share.
+    - `share` (m,) float: share of each box's volume inside the domain.
+    - `inner` (m, d) float: a point inside the domain and the box, for cut boxes with a share.
     """
 
     filling = 0.5
@@ -183,14 +172,10 @@ class SolidCoverage(CutCoverage):
     def _conserve(self, cut: np.ndarray, family: np.ndarray, wanted: np.ndarray, volume: np.ndarray) -> None:
         """Change the shares of the cut boxes so that the volumes of each family sum up to `wanted`, if they can.
 
-        Parameters
-        ----------
-        cut : (c,) int
-        family : (m,) int
-            Of each box.
-        wanted : (f,) float
-        volume : (m,) float
-            Of each box.
+        - `cut`: (c,) int
+        - `family` (m,) int: of each box.
+        - `wanted`: (f,) float
+        - `volume` (m,) float: of each box.
         """
         part = volume[cut] * self.share[cut]
         kin = family[cut]

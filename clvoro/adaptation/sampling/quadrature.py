@@ -30,11 +30,8 @@ _JUMP = 4.0
 def _slopes(points: np.ndarray, values: np.ndarray) -> np.ndarray:
     """Return the root mean square of |grad value| in boxes, (m,), by differences of neighboring Gauss points.
 
-    Parameters
-    ----------
-    points : (m, 3^d, d) float
-        Gauss points. Some may have been moved, even onto each other.
-    values : (m, 3^d) float
+    - `points` (m, 3^d, d) float: Gauss points. Some may have been moved, even onto each other.
+    - `values`: (m, 3^d) float
     """
     m, _, dim = points.shape
     rows = (m, *(3,) * dim)
@@ -67,34 +64,21 @@ class DensityTree:
 
     Work is bounded: refinement ends at 2^17 boxes or about 30 levels (20 in 3D). `error` has the error reached.
 
-    Parameters
-    ----------
-    field : callable
-        h(points (n, d)) -> (n,); a `Field`, or a `Sizing` (evaluated on its device).
-    domain : Domain
-        Boxes at its boundary count by their exact share inside. h is evaluated inside only: Gauss points outside are
-        replaced by a point inside the box.
-    tolerance : float
-        Relative error of the integral.
+    - `field`: h(points (n, d)) -> (n,); a `Field`, or a `Sizing` (evaluated on its device).
+    - `domain`: boxes at its boundary count by their exact share inside. h is evaluated inside only: Gauss points
+      outside are replaced by a point inside the box.
+    - `tolerance`: relative error of the integral.
 
-    Attributes
-    ----------
-    boxes : BoxTree
-    coverage : FullCoverage
-        The part of each box inside the domain.
-    cells : (m,) float
-        Integral of h^-d over the part of each box inside the domain.
-    slopes : (m, d) float
-        Mean change of log(h^-d) across each box.
-    slopes_of_size : (m,) float
-        |grad h| in each box: the root mean square of the slopes between samples, which a kink does not cancel.
-    error : float
-        Sum of the error estimates, in cells.
+    Its attributes:
+    - `boxes`: BoxTree
+    - `coverage`: the part of each box inside the domain.
+    - `cells` (m,) float: integral of h^-d over the part of each box inside the domain.
+    - `slopes` (m, d) float: mean change of log(h^-d) across each box.
+    - `slopes_of_size` (m,) float: |grad h| in each box: the root mean square of the slopes between samples, which a
+      kink does not cancel.
+    - `error`: sum of the error estimates, in cells.
 
-    Raises
-    ------
-    SizeFieldError
-        If h is not positive and finite, or h^-d is not finite, at a sampled point.
+    Raises `SizeFieldError` if h is not positive and finite, or h^-d is not finite, at a sampled point.
     """
 
     def __init__(self, field: Callable[[np.ndarray], np.ndarray], domain: Domain, tolerance: float = 1e-4):

@@ -21,11 +21,7 @@ from .quadrature import DensityTree
 class Charted:
     """A size field on a curved domain as a function of places in its chart.
 
-    Parameters
-    ----------
-    field : callable
-        h(points (n, d)) -> (n,).
-    domain : Domain
+    - `field`: h(points (n, d)) -> (n,).
     """
 
     def __init__(self, field: Callable[[np.ndarray], np.ndarray], domain: Domain) -> None:
@@ -60,23 +56,12 @@ _TOLERANCE = 1e-3  # relative error of the integral in the tree for sampling
 def count_cells(field: Callable[[np.ndarray], np.ndarray] | float, domain: Domain, tolerance: float = 1e-4) -> float:
     """Return the number of cells that `field` requires: the integral of h^-d over the domain.
 
-    Parameters
-    ----------
-    field : Field, Sizing, callable or number
-        A `Sizing` is evaluated on its device, anything else on the host.
-    domain : Domain
-    tolerance : float
-        Relative error; see `clvoro.adaptation.sampling.quadrature.DensityTree`.
+    - `field`: a `Sizing` is evaluated on its device, anything else on the host.
+    - `tolerance`: relative error; see `clvoro.adaptation.sampling.quadrature.DensityTree`.
 
-    Returns
-    -------
-    float
-        Can be less than 1, if h is larger than the domain.
+    The number is less than 1 if h is larger than the domain.
 
-    Raises
-    ------
-    SizeFieldError
-        If h is not positive and finite somewhere; names the place.
+    Raises `SizeFieldError` if h is not positive and finite somewhere; names the place.
     """
     if not isinstance(tolerance, Real) or not 0 < tolerance < 1:
         raise InputError(f"tolerance is {tolerance!r}, expected a number between 0 and 1")
@@ -104,24 +89,13 @@ def sample_density(
     distributed along the curve at equal steps of the cumulated expectation (systematic sampling), so that every box of
     the tree gets its share, rounded up or down. Within its box a point is drawn from a log-linear density.
 
-    Parameters
-    ----------
-    field : Field, Sizing, callable or number
-    domain : Domain
-    n : int
-        At least 1.
-    seed : int
-        Seed of numpy's PCG64.
-    real : dtype, optional
-        Precision in which the points are distinct in the device's coordinates; by default that of the field
-        (`Sizing.real`) or float64.
-    tree : DensityTree, optional
-        The tree of the field from `density_tree`. It is changed.
+    - `n`: at least 1.
+    - `seed`: seed of numpy's PCG64.
+    - `real`: precision in which the points are distinct in the device's coordinates; by default that of the field
+      (`Sizing.real`) or float64.
+    - `tree`: the tree of the field from `density_tree`. It is changed.
 
-    Returns
-    -------
-    (n, d) float64
-        Physical coordinates, distinct and strictly inside, in the order of the curve.
+    The result is (n, d) float64: physical coordinates, distinct and strictly inside, in the order of the curve.
     """
     n, seed = _check_arguments(n, seed)
     field = _evaluator(field)
@@ -139,20 +113,13 @@ def replace_far(
     together are `STRETCH`. Where there are more than ``FAR**d`` times as many of one kind as of the other, the expected
     points replace the given ones.
 
-    Parameters
-    ----------
-    points : (k, d) float64
-        Inside the domain.
-    tree, domain, n, seed, real
-        As for `sample_density`.
+    - `points` (k, d) float64: inside the domain.
+    - `tree`, `domain`, `n`, `seed`, `real`: as for `sample_density`.
 
-    Returns
-    -------
-    (m, d) float64
-        Those of `points` that are kept, then new ones. Without points, or if none is kept, these are the `n` points of
-        `sample_density`.
-    (l,) int
-        Rows in `points` of those that are kept.
+    Results:
+    - (m, d) float64: those of `points` that are kept, then new ones. Without points, or if none is kept, these are the
+      `n` points of `sample_density`.
+    - (l,) int: rows in `points` of those that are kept.
     """
     chart = domain.chart()
     if chart.domain is not domain:
@@ -195,20 +162,11 @@ def _are_far(expected: np.ndarray, given: np.ndarray, dim: int) -> np.ndarray:
 def sample_uniform(domain: Domain, n: int, seed: int, real: DTypeLike = np.float64) -> np.ndarray:
     """Return `n` independent uniform random points, the start in the paper.
 
-    Parameters
-    ----------
-    domain : Domain
-    n : int
-        At least 1.
-    seed : int
-        Seed of numpy's PCG64.
-    real : dtype
-        Precision in which the points are distinct in the device's coordinates.
+    - `n`: at least 1.
+    - `seed`: seed of numpy's PCG64.
+    - `real`: precision in which the points are distinct in the device's coordinates.
 
-    Returns
-    -------
-    (n, d) float64
-        Physical coordinates, distinct and strictly inside.
+    The result is (n, d) float64: physical coordinates, distinct and strictly inside.
     """
     n, seed = _check_arguments(n, seed)
     chart = domain.chart()

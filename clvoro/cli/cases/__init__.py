@@ -41,10 +41,7 @@ class Case:
     def from_toml(cls, text: str, name: str, folder: Path = Path()) -> Case:
         """Read a case from TOML text; `name` is its name in errors, and the default of its key `name`.
 
-        Raises
-        ------
-        InputError
-            With the key, its value and what was expected.
+        Raises `InputError` with the key, its value and what was expected.
         """
         place = f"{name}:"
         try:
@@ -219,10 +216,7 @@ GEOMETRIES = {
 def load_case(name: str | Path) -> Case:
     """Return the case of a built-in name or of a TOML file.
 
-    Raises
-    ------
-    InputError
-        If there is neither, or the file is not a case.
+    Raises `InputError` if there is neither, or the file is not a case.
     """
     known = builtin_cases()
     if str(name) in known:

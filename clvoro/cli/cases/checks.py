@@ -34,21 +34,12 @@ _WORDS = {
 def check(kind: type[T], content: object, place: str, homes: Mapping[str, Iterable[str]]) -> T:
     """Return `content` as an instance of `kind`.
 
-    Parameters
-    ----------
-    kind : type
-        A `msgspec.Struct` of `schema`.
-    content : object
-        Tables, lists and values as TOML has them.
-    place : str
-        Name of `content` in errors: ``"case.toml:"`` or ``"name: run"``.
-    homes : mapping
-        Keys by the names of the tables that take them, for hints.
+    - `kind`: a `msgspec.Struct` of `schema`.
+    - `content`: tables, lists and values as TOML has them.
+    - `place`: name of `content` in errors: ``"case.toml:"`` or ``"name: run"``.
+    - `homes`: keys by the names of the tables that take them, for hints.
 
-    Raises
-    ------
-    InputError
-        With the first key that is wrong, its value and what was expected.
+    Raises `InputError` with the first key that is wrong, its value and what was expected.
     """
     _require_finite(content, place)
     try:

@@ -30,10 +30,7 @@ class Labeled:
 def read_grid(path: Path, variable: str | None) -> Any:
     """Return a variable of a file with its coordinates, for `earth.from_xarray`; None for an array without them.
 
-    Parameters
-    ----------
-    variable : str or None
-        Its name; by default the only one of two dimensions, besides those of length 1.
+    - `variable`: its name; by default the only one of two dimensions, besides those of length 1.
     """
     if path.suffix.lower() == ".npz":
         return _from_npz(path, variable)

@@ -459,10 +459,7 @@ def _require(fits: bool, size: Kind, remedy: str, domain: Domain) -> None:
 def load_array(path: Path, place: str) -> np.ndarray:
     """Read an array from a `.npy` file, or the array `points` from a `.npz` file; `place` is the key that names it.
 
-    Raises
-    ------
-    InputError
-        If there is no such file or it holds no such array.
+    Raises `InputError` if there is no such file or it holds no such array.
     """
     try:
         return read_array(path, "points")
@@ -657,9 +654,7 @@ def read_polygon(
 ) -> Polygon:
     """Read polygons from a file of GeoJSON or well-known text; `key` names it in the case.
 
-    Raises
-    ------
-    InputError
+    Raises `InputError`.
     """
     if path.suffix.lower() in FOREIGN:
         raise InputError(

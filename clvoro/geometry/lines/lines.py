@@ -40,10 +40,7 @@ class Network(NamedTuple):
 class Lines(Borders):
     """Lines inside a domain; `Domain.with_lines` makes them. Also a shape for `clvoro.sizing.Distance`.
 
-    Attributes
-    ----------
-    paths : tuple of (k, 2) float64
-        The vertices of each line. Curves are polylines within their tolerance.
+    - `paths` tuple of (k, 2) float64: the vertices of each line. Curves are polylines within their tolerance.
     """
 
     word = "lines"
@@ -110,15 +107,8 @@ class Lines(Borders):
     def place(self, domain: Domain, free: Domain, size: Size) -> LinePairs:
         """Return the generators beside the lines of `domain`, in its part `free` without layers.
 
-        Raises
-        ------
-        InputError
-            If holes have no room.
-
-        Warns
-        -----
-        MismatchWarning
-            If a line is left out at a place without room, or in layers; says where.
+        Raises `InputError` if holes have no room.
+        Warns with `MismatchWarning` if a line is left out at a place without room, or in layers; says where.
         """
         from .pairs import place_pairs
 

@@ -23,12 +23,8 @@ _CLEAR = 1e-6  # of the domain: least distance between obstacles, and from walls
 class Obstacles(Lines):
     """Holes in a box that is periodic; `Box.without` makes them. Also a shape for `clvoro.sizing.Distance`.
 
-    Attributes
-    ----------
-    parts : BoundaryNames
-        The boundaries that the holes are, by name.
-    measure : float
-        Area of all holes.
+    - `parts`: the boundaries that the holes are, by name.
+    - `measure`: area of all holes.
     """
 
     def __init__(self, domain: Domain, holes: Sequence[object], names: Mapping[str, Walls] | None = None) -> None:

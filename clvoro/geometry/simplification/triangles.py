@@ -93,16 +93,11 @@ def _split(x: np.ndarray, edges: np.ndarray, n: int, share: np.ndarray | None = 
 class Triangles:
     """The Delaunay triangles of the ends of edges, of which each is a side of them.
 
-    Attributes
-    ----------
-    x, h : points (n, 2), sizes (n,)
-    edges : (k, 2) int
-        With water on the left. They are divided as far as is necessary.
-    n_vertices : int
-        The first points are vertices of the domain; others divide edges.
-    corners, neighbors : (t, 3) int
-        The neighbor k, or -1, is beyond the side that does not have corner k.
-    water : (t,) bool
+    - `x`, `h`: points (n, 2), sizes (n,)
+    - `edges` (k, 2) int: with water on the left. They are divided as far as is necessary.
+    - `n_vertices`: the first points are vertices of the domain; others divide edges.
+    - `corners`, `neighbors` (t, 3) int: the neighbor k, or -1, is beyond the side that does not have corner k.
+    - `water`: (t,) bool
     """
 
     def __init__(

@@ -65,10 +65,7 @@ _ROUNDS = 40
 def place_pairs(sheets: Sheets, domain: Domain, size: Callable[[np.ndarray], np.ndarray]) -> FixedGenerators:
     """Return the generators beside `sheets` in `domain`, where cells have the sizes h = size(points (n, 3)).
 
-    Raises
-    ------
-    InputError
-        If there is no room for them.
+    Raises `InputError` if there is no room for them.
     """
     triangles = _off_walls(sheets, domain)
     around = _place_around_edges(sheets, triangles, domain, size)
@@ -82,10 +79,7 @@ def place_pairs(sheets: Sheets, domain: Domain, size: Callable[[np.ndarray], np.
 class _Fold(ChainOfChords):
     """A chain at which patches end or meet: generators beside each of them, and in wide sectors between.
 
-    Parameters
-    ----------
-    edges : (m,) int
-        The edge of `sheets` on which each segment of `line` lies.
+    - `edges` (m,) int: the edge of `sheets` on which each segment of `line` lies.
     """
 
     def __init__(
@@ -267,13 +261,9 @@ def _cut(inner: np.ndarray, outer: np.ndarray, inside: Callable[[np.ndarray], np
 class _Places(NamedTuple):
     """Points of patches at which cells meet.
 
-    Attributes
-    ----------
-    x, h, patch : (m, 3), (m,) float and (m,) int
-    radius : (m,) float
-        Distance from the nearest generators at first.
-    members : list of list of int
-        The points of the sample whose cells meet there.
+    - `x`, `h`, `patch`: (m, 3), (m,) float and (m,) int
+    - `radius` (m,) float: distance from the nearest generators at first.
+    - `members`: the points of the sample whose cells meet there.
     """
 
     x: np.ndarray
@@ -286,10 +276,8 @@ class _Places(NamedTuple):
 class _Sample:
     """Points on patches, and the generators above and below.
 
-    Attributes
-    ----------
-    q, h, patch : (s, 3), (s,) float and (s,) int
-    generators : list of list of int
+    - `q`, `h`, `patch`: (s, 3), (s,) float and (s,) int
+    - `generators`: list of list of int
     """
 
     def __init__(

@@ -22,20 +22,14 @@ from ..triangles import segment_distance2
 class Sheets:
     """Smooth patches of a surface that may be open and branch, and the chains of edges at which they end.
 
-    Attributes
-    ----------
-    surface : Surface
-        Triangles of one patch have the same orientation.
-    patch : (t,) int
-    normals : (t, 3) float
-    edges : (e, 2) int
-        Edges that are creases, end the surface, or join three patches or more; vertices of the surface.
-    chain : (e,) int
-        The chain of each edge, ascending; each edge begins where the one before ends.
-    corners : (c,) int
-        Vertices at which chains meet, end or turn sharply.
-    triangle_starts, triangles_at : (e + 1,) and (k,) int
-        The triangles at each edge.
+    - `surface`: triangles of one patch have the same orientation.
+    - `patch`: (t,) int
+    - `normals`: (t, 3) float
+    - `edges` (e, 2) int: edges that are creases, end the surface, or join three patches or more; vertices of the
+      surface.
+    - `chain` (e,) int: the chain of each edge, ascending; each edge begins where the one before ends.
+    - `corners` (c,) int: vertices at which chains meet, end or turn sharply.
+    - `triangle_starts`, `triangles_at` (e + 1,) and (k,) int: the triangles at each edge.
     """
 
     surface: Surface

@@ -42,16 +42,10 @@ _SMALL = 1e-3
 class Surfaces(Borders):
     """Triangulated surfaces inside a domain; `Domain.with_surfaces` makes them.
 
-    Attributes
-    ----------
-    names : tuple of str
-        One for each surface.
-    surface : Surface
-        All triangles, such as for `clvoro.sizing.Distance`.
-    part : (t,) int
-        The surface that each triangle belongs to.
-    angle : float
-        In degrees; see `Solid`.
+    - `names`: one for each surface.
+    - `surface`: all triangles, such as for `clvoro.sizing.Distance`.
+    - `part` (t,) int: the surface that each triangle belongs to.
+    - `angle`: in degrees; see `Solid`.
     """
 
     word = "surfaces"
@@ -166,10 +160,7 @@ class Surfaces(Borders):
     def place(self, domain: Domain, free: Domain, size: Size) -> FixedGenerators:
         """Return the generators beside the surfaces.
 
-        Raises
-        ------
-        InputError
-            If there is no room for them.
+        Raises `InputError` if there is no room for them.
         """
         if free is not domain:
             raise InputError(

@@ -48,19 +48,12 @@ def rebuild_on_sphere(diagram: Diagram) -> dict[str, np.ndarray]:
 def bisector_corners(starts: np.ndarray, normals: np.ndarray, levels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return where the bisectors of each cell cross those before them, in the tangent plane at the generator.
 
-    Parameters
-    ----------
-    starts : (n + 1,) int
-        Rows of the cells.
-    normals, levels : (m, 2), (m,) float64
-        The lines n.p = level.
+    - `starts` (n + 1,) int: rows of the cells.
+    - `normals`, `levels` (m, 2), (m,) float64: the lines n.p = level.
 
-    Returns
-    -------
-    corners : (m, 2) float64
-        Not finite where lines are parallel.
-    sines : (m,) float64
-        Of the angles from the normals before to the normals.
+    Results:
+    - `corners` (m, 2) float64: not finite where lines are parallel.
+    - `sines` (m,) float64: of the angles from the normals before to the normals.
     """
     before = np.argsort(following(starts))
     one, other = normals[before], normals
@@ -96,28 +89,17 @@ class Doubts:
 class Rebuilt:
     """The cells of a diagram, computed from generators, corners and the graph alone.
 
-    Attributes
-    ----------
-    owner : (m,) int
-        Cell of each face.
-    areas : (m, d) float
-        Outward normal of each face times its measure.
-    middles : (m, d) float
-        Centroids of the faces.
-    perimeters : (n,) float
-        Sum of the faces' measures (surface in 3D).
-    volumes, centroids : (n,) and (n, d) float
-    cells, corners : (k,) int
-        Every corner of every cell: the cell and the vertex.
-    unit : float
-        Round-off of a position.
-    unit_of_cell : (n,) float
-        Round-off of a corner relative to its generator.
-    period_off : float
-        Round-off of the periods of a periodic box, together; see `Box`.
-    remade : bool
-        Whether the diagram's own measures of faces come from its corners, too, so that their round-off is that of
-        positions.
+    - `owner` (m,) int: cell of each face.
+    - `areas` (m, d) float: outward normal of each face times its measure.
+    - `middles` (m, d) float: centroids of the faces.
+    - `perimeters` (n,) float: sum of the faces' measures (surface in 3D).
+    - `volumes`, `centroids`: (n,) and (n, d) float
+    - `cells`, `corners` (k,) int: every corner of every cell: the cell and the vertex.
+    - `unit`: round-off of a position.
+    - `unit_of_cell` (n,) float: round-off of a corner relative to its generator.
+    - `period_off`: round-off of the periods of a periodic box, together; see `Box`.
+    - `remade`: whether the diagram's own measures of faces come from its corners, too, so that their round-off is that
+      of positions.
     """
 
     edges: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None

@@ -121,10 +121,7 @@ class Boundary:
         The first `generators` generators of `t` lie in the domain, the others are ghost generators. If the boundary
         crosses cells of ghost generators, the indices of these are returned, (i,) int, counted from `generators` on.
 
-        Raises
-        ------
-        BoundaryError
-            If round-off stops the tracing of an edge.
+        Raises `BoundaryError` if round-off stops the tracing of an edge.
         """
         engine, k, room, edges = self.engine, self._kernels, self._room, self.edges
         vertices, inner = self.vertices, self.inner

@@ -37,13 +37,9 @@ class Cut(DomainSteps):
 
     Ghost generators have cells, because the boundary is traced through them, but no values.
 
-    Parameters
-    ----------
-    spacing : callable or None
-        Distance of generators near points (k, 2) of the boundary, (k,); see `graded_places`. None: no ghost
-        generators. The diagram is the same, but slow to make where many generators surround a wide hole.
-    straight : bool
-        Measure cells with straight sides along the boundary, until `measure_exactly`; see `Trim.trim`.
+    - `spacing`: distance of generators near points (k, 2) of the boundary, (k,); see `graded_places`. None: no ghost
+      generators. The diagram is the same, but slow to make where many generators surround a wide hole.
+    - `straight`: measure cells with straight sides along the boundary, until `measure_exactly`; see `Trim.trim`.
     """
 
     def __init__(
@@ -163,10 +159,7 @@ def graded_places(domain: Polygon, spacing: Callable[[np.ndarray], np.ndarray], 
     for their neighbors. Ghost generators bound these cells at little cost. They do not change the diagram inside the
     domain as long as none of their cells reaches into it; `boundary_crossings.py` checks this in each step.
 
-    Parameters
-    ----------
-    spacing : callable
-        Distance of generators from their neighbors near points (k, 2) of the boundary, (k,).
+    - `spacing`: distance of generators from their neighbors near points (k, 2) of the boundary, (k,).
     """
     lower, upper = domain.clip_box
     edge = float((upper - lower).max()) / 8

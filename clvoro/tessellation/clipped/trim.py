@@ -76,10 +76,7 @@ class Trim:
         cell has all its pieces. With `straight` volumes, offsets and covariances are those of cells with straight sides
         along the boundary, as the mesh for solvers has them.
 
-        Raises
-        ------
-        BoundaryError
-            If loops of faces are not closed due to round-off.
+        Raises `BoundaryError` if loops of faces are not closed due to round-off.
         """
         engine, k, room = self.engine, self._kernels, self._room
         u, places = chords.touched_count, chords.count + chords.touched_count

@@ -78,14 +78,9 @@ class GhostImages:
 
         In a power diagram rows of `points` end with weights.
 
-        Parameters
-        ----------
-        halo : Halo
-            Its depths are set to those required, times `factor`.
-        grow : bool
-            Let no depth become smaller.
-        room : float
-            Share of `SIDEWAYS` and `OUTWARDS`: 0 in the last diagram of a run.
+        - `halo`: its depths are set to those required, times `factor`.
+        - `grow`: let no depth become smaller.
+        - `room`: share of `SIDEWAYS` and `OUTWARDS`: 0 in the last diagram of a run.
         """
         engine, k, d = self.engine, self._kernels, self.engine.dim
         periods = domain.periods(engine.real)
@@ -219,23 +214,15 @@ class GhostImages:
     ) -> tuple[Tessellation, bool, int, int]:
         """Fold `t`, the diagram of `part`, whose ghosts are images in `halo`.
 
-        Parameters
-        ----------
-        points : (n, d) real
-            The generators.
-        share : float
-            Largest share of a cell behind a face that only one of its two cells has. Such faces are dropped.
-        nearest : bool
-            Report faces whose neighbor is not the nearest image of its generator (`FAR`).
+        - `points` (n, d) real: the generators.
+        - `share`: largest share of a cell behind a face that only one of its two cells has. Such faces are dropped.
+        - `nearest`: report faces whose neighbor is not the nearest image of its generator (`FAR`).
 
-        Returns
-        -------
-        folded : Tessellation
-        enough : bool
-            Whether the halo was deep enough for all cells. If not, the diagram is wrong, and the halo's required
-            depths are up to date.
-        flags, generator : int
-            `FAR`, `COLLAPSED` or both, and the first generator with such a face.
+        Results:
+        - `folded`: Tessellation
+        - `enough`: whether the halo was deep enough for all cells. If not, the diagram is wrong, and the halo's
+          required depths are up to date.
+        - `flags`, `generator`: `FAR`, `COLLAPSED` or both, and the first generator with such a face.
         """
         n = part.n_own
         self._store_depths(part, halo)

@@ -38,17 +38,10 @@ class FewCellsError(InputError):
 class Images(DomainSteps):
     """The steps of one periodic box.
 
-    Parameters
-    ----------
-    stages : TessellationStages
-    domain : Domain
-    halo : Halo, optional
-        That of a coarser level of the same domain, as the first guess.
+    - `halo`: that of a coarser level of the same domain, as the first guess.
 
-    Attributes
-    ----------
-    box : ExtendedBox
-        Contains every cell, wherever its generator is.
+    Its attributes:
+    - `box`: contains every cell, wherever its generator is.
     """
 
     def __init__(self, stages: TessellationStages, domain: Domain, halo: Halo | None = None) -> None:
@@ -105,12 +98,8 @@ class Images(DomainSteps):
     def finish(self, part: Part, t: Tessellation, points: cla.Array, exact: bool, nearest: bool) -> Tessellation | None:
         """Fold `t`; None if the halo was not deep enough. It will be deeper.
 
-        Raises
-        ------
-        InputError
-            If generators coincide up to round-off.
-        FewCellsError
-            If a neighbor is not the nearest image of its generator.
+        Raises `InputError` if generators coincide up to round-off. Raises `FewCellsError` if a neighbor is not the
+        nearest image of its generator.
         """
         share = EXACT_SHARE if exact else ROUGH_SHARE
         fold = self.stages.ghost_images.fold

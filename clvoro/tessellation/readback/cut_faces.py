@@ -16,14 +16,9 @@ class CutFaces:
 
     The arrays are small, because they cover only cells that the boundary crosses.
 
-    Attributes
-    ----------
-    touched : (t,) int32
-        The cells that the boundary crosses.
-    shifted : bool
-        Whether the boundary was shifted by round-off.
-    edge_numbers : (k,) int
-        Number in the caller's order of each edge on the device.
+    - `touched` (t,) int32: the cells that the boundary crosses.
+    - `shifted`: whether the boundary was shifted by round-off.
+    - `edge_numbers` (k,) int: number in the caller's order of each edge on the device.
     """
 
     def __init__(self, made: Trimmed, n: int, m: int, scale: float) -> None:
@@ -102,21 +97,13 @@ class CutFaces:
 def chain_faces(slots: np.ndarray, ends: np.ndarray, starts: np.ndarray) -> tuple[np.ndarray, dict[int, list[int]]]:
     """Order faces along the loops of each cell.
 
-    Parameters
-    ----------
-    slots : (m,) int
-        Index of each face, row by row.
-    ends : (m, 2) int
-        First and last vertex of each face, by index.
-    starts : (n + 1,) int32
-        Rows of `slots`.
+    - `slots` (m,) int: index of each face, row by row.
+    - `ends` (m, 2) int: first and last vertex of each face, by index.
+    - `starts` (n + 1,) int32: rows of `slots`.
 
-    Returns
-    -------
-    order : (m,) int
-        `slots` in that order.
-    lengths : dict
-        The lengths of the loops of those rows that have several.
+    Results:
+    - `order` (m,) int: `slots` in that order.
+    - `lengths`: the lengths of the loops of those rows that have several.
     """
     ends, m = ends[slots], len(slots)
     row = np.repeat(np.arange(len(starts) - 1), np.diff(starts))

@@ -41,13 +41,9 @@ def fetch_diagram(
 ) -> Diagram:
     """Return `t` as a `Diagram` with rows in the order of `labels` (n,); arrays are read when first used.
 
-    Parameters
-    ----------
-    copy : bool
-        Copy the arrays of `t`. Without a copy the caller must not reuse these buffers.
-    held : int, optional
-        How many of the first generators of a run are not moved. Given generators are moved only where OpenFOAM would
-        reject cells.
+    - `copy`: copy the arrays of `t`. Without a copy the caller must not reuse these buffers.
+    - `held`: how many of the first generators of a run are not moved. Given generators are moved only where OpenFOAM
+      would reject cells.
     """
     sheets = domain.sheets
     if domain.curved_walls:
@@ -178,14 +174,9 @@ def faces_on_host(t: Tessellation) -> Tessellation:
 def merge_ends(corners: np.ndarray, starts: np.ndarray, dropped: np.ndarray) -> np.ndarray:
     """Return `corners` of cells in 2D, (m,), where both ends of a dropped face are the same vertex.
 
-    Parameters
-    ----------
-    corners : (m or more,) int
-        First vertex of each face.
-    starts : (n + 1,) int32
-        Rows of the faces.
-    dropped : (k,) int
-        Faces that are left out.
+    - `corners` (m or more,) int: first vertex of each face.
+    - `starts` (n + 1,) int32: rows of the faces.
+    - `dropped` (k,) int: faces that are left out.
     """
     count = int(corners.max(initial=-1)) + 1
     ends = np.arange(1, starts[-1] + 1)
@@ -208,16 +199,11 @@ class _DiagramReader:
 
     With `copy` the reader owns its arrays, since the stages reuse theirs.
 
-    Attributes
-    ----------
-    whole : Tessellation
-    box : ClipBox
-        The box that clips its cells.
-    places : (m,) int, or None
-        Index in `whole` of each face on the device; None if it is the same.
-    codes : (m,) int32, or None
-        Codes of the images across the faces, in a periodic box.
-    cut : CutFaces, or None
+    - `whole`: Tessellation
+    - `box`: the box that clips its cells.
+    - `places` (m,) int, or None: index in `whole` of each face on the device; None if it is the same.
+    - `codes` (m,) int32, or None: codes of the images across the faces, in a periodic box.
+    - `cut`: CutFaces, or None
     """
 
     def __init__(self, engine: Engine, domain: Domain, t: Tessellation, labels: cla.Array, copy: bool) -> None:
@@ -334,10 +320,7 @@ class _DiagramReader:
     def faces(self) -> SharedFaces:
         """Vertices, each once, in 3D, and the loops of faces in the order of `whole`.
 
-        Raises
-        ------
-        InputError
-            If round-off has made cells wrong.
+        Raises `InputError` if round-off has made cells wrong.
         """
         # The device needs their memory.
         whole, self.t = self.whole, faces_on_host(self.t)

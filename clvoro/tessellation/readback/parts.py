@@ -111,16 +111,11 @@ SINGLE.shared = True
 class CellRows:
     """The cells of a part on the host, as the device has them; neighbors are labels.
 
-    Attributes
-    ----------
-    labels : (n,) int32
-    counts : (n,) int32
-        Number of faces.
-    cells : tuple of (n, ...) arrays
-        Points, volumes, offsets and covariances.
-    faces : tuple of (m, ...) arrays
-        Labels of neighbors, walls being negative; measures and centroids.
-    round_off : int
+    - `labels`: (n,) int32
+    - `counts` (n,) int32: number of faces.
+    - `cells` tuple of (n, ...) arrays: points, volumes, offsets and covariances.
+    - `faces` tuple of (m, ...) arrays: labels of neighbors, walls being negative; measures and centroids.
+    - `round_off`: int
     """
 
     labels: np.ndarray

@@ -49,12 +49,8 @@ class SharedFaces:
 def share_faces(engine: Engine, box: ClipBox, t: Tessellation) -> SharedFaces:
     """Return the vertices and faces of `t`, the same from both cells of every face.
 
-    Raises
-    ------
-    MemoryLimitError
-        If the loops are too long for 32-bit indices.
-    CloseError
-        If round-off leaves too much of a cell uncertain.
+    Raises `MemoryLimitError` if the loops are too long for 32-bit indices. Raises `CloseError` if round-off leaves too
+    much of a cell uncertain.
     """
     return FaceSharing(engine, box, t).run()
 
@@ -62,18 +58,13 @@ def share_faces(engine: Engine, box: ClipBox, t: Tessellation) -> SharedFaces:
 class FaceSharing:
     """Vertices are merged until the two half-faces of every face are identical.
 
-    Attributes
-    ----------
-    half_faces : HalfFaces
-    labels : (c,) int32
-        Of each corner: its vertex, named by its first corner.
-    best_corners : (c,) int32
-        Of each vertex: the corner that its faces determine best.
-    reduced, counts : (3 c,), (h,) int32
-        The loops of half-faces as vertices, without repetitions and spurs, and their lengths.
-    differs : (h,) uint8
-    merged : bool
-        Whether any vertices have been merged.
+    - `half_faces`: HalfFaces
+    - `labels` (c,) int32: of each corner: its vertex, named by its first corner.
+    - `best_corners` (c,) int32: of each vertex: the corner that its faces determine best.
+    - `reduced`, `counts` (3 c,), (h,) int32: the loops of half-faces as vertices, without repetitions and spurs, and
+      their lengths.
+    - `differs`: (h,) uint8
+    - `merged`: whether any vertices have been merged.
     """
 
     def __init__(self, engine: Engine, box: ClipBox, t: Tessellation) -> None:

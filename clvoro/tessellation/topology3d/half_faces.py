@@ -49,10 +49,7 @@ def _kernels(engine: Engine, capacity: int) -> Kernels:
 def list_half_faces(engine: Engine, box: ClipBox, t: Tessellation) -> HalfFaces:
     """Clip each cell of `t` by its neighbors, and return its faces.
 
-    Raises
-    ------
-    MemoryLimitError
-        If the corners are too many for 32-bit indices.
+    Raises `MemoryLimitError` if the corners are too many for 32-bit indices.
     """
     n, scan = t.n, Scan(engine)
     corner_starts, starts = engine.empty(n + 1, np.int32), engine.empty(n + 1, np.int32)
