@@ -90,7 +90,7 @@ def start_workers(device: cl.Device) -> None:
 def build_ahead(engine: Engine, job: str = "") -> int:
     """Let workers build the kernels of a run on `engine`, or of another `job`, if this is the first one of its kind.
 
-    The number is 0 if it is not the first, or nothing is recorded.
+    Return the number of recorded kernels; 0 if this is not the first, or nothing is recorded.
     """
     kind, device = kind_of(engine, job), engine.queue.device
     in_processes = on_pocl(device)
