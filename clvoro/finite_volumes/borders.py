@@ -37,11 +37,8 @@ _ROUNDS = 4
 class _OnSurfaces:
     """A mesh whose faces lie on surfaces.
 
-    Attributes
-    ----------
-    diagram : Diagram
-    rejected : (k,) int
-        The cells near surfaces that OpenFOAM rejects.
+    - `diagram`: Diagram
+    - `rejected` (k,) int: the cells near surfaces that OpenFOAM rejects.
     """
 
     diagram: Diagram
@@ -68,18 +65,10 @@ def on_surfaces(
     is flat. Elsewhere it is near the surface, with narrow faces between cells of different pairs around it. Where
     OpenFOAM would reject cells, generators there are moved a little, and the mesh is made again.
 
-    Parameters
-    ----------
-    diagram : Diagram
-    sheets : Sheets
-    points : (n, 3) float
-        The generators of `diagram`.
-    sizes : (n,) float
-        h at the generators.
-    remake : callable
-        Returns the diagram of other generators (n, 3).
-    held : int
-        How many of the first generators are not moved.
+    - `points` (n, 3) float: the generators of `diagram`.
+    - `sizes` (n,) float: h at the generators.
+    - `remake`: returns the diagram of other generators (n, 3).
+    - `held`: how many of the first generators are not moved.
     """
     domain, first = diagram.domain, _made(diagram, sheets)
 
@@ -204,14 +193,9 @@ def _with_pairs_only(mesh: Faces, rows: np.ndarray, small: np.ndarray, vertices:
     at surfaces that meet there, and of its walls. Two ends of an edge of a small face become one vertex if they have
     the same numbers, or if one has all the numbers of the other and four or more. Small faces then have no area.
 
-    Parameters
-    ----------
-    rows : (k,) int
-        The faces on surfaces.
-    small : (k,) bool
-        Which of these are small.
-    vertices : (v,) int
-        The corners of these faces.
+    - `rows` (k,) int: the faces on surfaces.
+    - `small` (k,) bool: which of these are small.
+    - `vertices` (v,) int: the corners of these faces.
     """
     n = mesh.n_cells
     pairs = np.stack([mesh.owner[rows[~small]], mesh.neighbor[rows[~small]]], axis=1)

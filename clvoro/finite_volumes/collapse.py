@@ -47,18 +47,11 @@ def collapse_short(
     Faces that lose their area vanish, and their cells are no longer neighbors. An edge or face is left as it is if
     otherwise a face would be warped or a cell concave; see `DefectLimits`.
 
-    Parameters
-    ----------
-    mesh : Faces
-        Of the diagram, in 3D.
-    diagram : Diagram or None
-        What measures come from; None if they follow from the corners.
-    unwanted : (f,) bool, optional
-        Faces that are collapsed whatever their size.
-    chosen : (f,) bool, optional
-        Faces whose corners may move; all by default.
-    suspects : (f,) bool, optional
-        What `find_suspects` returns; by default it is called.
+    - `mesh`: of the diagram, in 3D.
+    - `diagram`: what measures come from; None if they follow from the corners.
+    - `unwanted` (f,) bool: faces that are collapsed whatever their size.
+    - `chosen` (f,) bool: faces whose corners may move; all by default.
+    - `suspects` (f,) bool: what `find_suspects` returns; by default it is called.
     """
     if suspects is None:
         suspects = find_suspects(mesh, diagram, chosen)
@@ -182,18 +175,12 @@ def _unfold(mesh: Faces, cells: MergingCells, upper: np.ndarray) -> Faces:
 class _Scan:
     """The sides of some faces, from one corner to the next, and which are short; which of the faces are small.
 
-    Attributes
-    ----------
-    faces : (f,) int
-    starts : (f + 1,) int
-        Rows of the sides of each face.
-    begin, end : (k,) int
-        Vertices.
-    code : (k,) int
-        Packed offset of the end from the beginning.
-    length, h : (k,) float
-    small : (f,) bool
-        Skewed faces count as small.
+    - `faces`: (f,) int
+    - `starts` (f + 1,) int: rows of the sides of each face.
+    - `begin`, `end` (k,) int: vertices.
+    - `code` (k,) int: packed offset of the end from the beginning.
+    - `length`, `h`: (k,) float
+    - `small` (f,) bool: skewed faces count as small.
     """
 
     def __init__(self, cells: MergingCells, faces: np.ndarray) -> None:

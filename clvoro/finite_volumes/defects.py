@@ -28,15 +28,11 @@ _PAIRS = 1 << 16
 class DefectLimits:
     """What cells must satisfy after a merge.
 
-    Attributes
-    ----------
-    flatness : float
-        Least area of a face over the sum of the areas of its triangles about its center.
-    concavity : float
-        In a cell the direction from the center of a face to that of another one has at most this cosine with the
-        outward normal of the first.
-    non_orthogonality, skewness : float
-        Largest values of the faces that change; a face that exceeds one of them must not get worse.
+    - `flatness`: least area of a face over the sum of the areas of its triangles about its center.
+    - `concavity`: in a cell the direction from the center of a face to that of another one has at most this cosine with
+      the outward normal of the first.
+    - `non_orthogonality`, `skewness`: largest values of the faces that change; a face that exceeds one of them must not
+      get worse.
     """
 
     flatness: float = 0.95
@@ -49,12 +45,8 @@ class DefectLimits:
 class Defects:
     """What is wrong with the cells at each set of vertices, (k,) each.
 
-    Attributes
-    ----------
-    count, serious : int
-        Warped faces, inverted tetrahedra, concave pairs of faces: all, and those without small faces.
-    angle, skewness : float
-        Largest non-orthogonality in degrees, and skewness of the faces.
+    - `count`, `serious`: warped faces, inverted tetrahedra, concave pairs of faces: all, and those without small faces.
+    - `angle`, `skewness`: largest non-orthogonality in degrees, and skewness of the faces.
     """
 
     count: np.ndarray
@@ -219,16 +211,10 @@ def concave_pairs(
 
     Checked is the cosine of the outward normal of a face and the direction from its center to that of another face.
 
-    Parameters
-    ----------
-    centers, areas : (3, k) float
-        Of each face as seen from a cell; areas point outward.
-    starts : (n + 1,) int
-        Rows of the faces of each cell.
-    limit : float
-        The largest cosine.
-    changed : (k,) bool
-        One face of a pair is changed.
+    - `centers`, `areas` (3, k) float: of each face as seen from a cell; areas point outward.
+    - `starts` (n + 1,) int: rows of the faces of each cell.
+    - `limit`: the largest cosine.
+    - `changed` (k,) bool: one face of a pair is changed.
     """
     found = [np.zeros((2, 0), np.int64)]
     normals = areas / np.maximum(lengths(areas), 1e-300)

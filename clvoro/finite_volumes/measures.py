@@ -400,10 +400,8 @@ class SolverMeasures:
 class PlaneMeasures:
     """Measures of faces and cells of a mesh in 2D: those of its prisms, in a fraction of the time.
 
-    Attributes
-    ----------
-    areas : (n,) float64
-    centroids : (n, 2) float64
+    - `areas`: (n,) float64
+    - `centroids`: (n, 2) float64
     """
 
     def __init__(self, mesh: Faces) -> None:

@@ -29,19 +29,12 @@ _CHUNK = 512
 class Merges:
     """Groups of vertices, each to become one vertex, in sets that are merged together or not at all.
 
-    Attributes
-    ----------
-    starts : (g + 1,) int
-    vertices : int
-        Vertices of group i, ``vertices[starts[i]:starts[i + 1]]``.
-    codes : int
-        Packed offsets of the images that coincide with the first vertex of the group.
-    sets : (g,) int
-        Set of each group, ascending from 0.
-    priority : (k,) float
-        The least is tried first.
-    reach : (k,) float
-        Most distance of vertices from the first of their group; groups that are wider are left out.
+    - `starts`: (g + 1,) int
+    - `vertices`: vertices of group i, ``vertices[starts[i]:starts[i + 1]]``.
+    - `codes`: packed offsets of the images that coincide with the first vertex of the group.
+    - `sets` (g,) int: set of each group, ascending from 0.
+    - `priority` (k,) float: the least is tried first.
+    - `reach` (k,) float: most distance of vertices from the first of their group; groups that are wider are left out.
     """
 
     starts: np.ndarray
@@ -80,14 +73,9 @@ class Merges:
 class _Finder:
     """The rows of a ragged array that have an item. They are found for the items that are looked for, not for all.
 
-    Parameters
-    ----------
-    starts : (r + 1,) int or None
-        None if each item is a row.
-    items : (k,) int
-        -1 for none.
-    size : int
-        Number of different items.
+    - `starts` (r + 1,) int or None: None if each item is a row.
+    - `items` (k,) int: -1 for none.
+    - `size`: number of different items.
     """
 
     def __init__(self, starts: np.ndarray | None, items: np.ndarray, size: int) -> None:
@@ -116,38 +104,22 @@ class MergingCells:
 
     In periodic directions images of a vertex are one vertex, and a corner of a face is a vertex with an offset.
 
-    Parameters
-    ----------
-    mesh : Faces
-    diagram : Diagram or None
-        See `collapse_short`.
-    rows : (f,) int
-        The faces of `mesh`; their corners, cells and offsets are the other parameters.
+    - `diagram`: see `collapse_short`.
+    - `rows` (f,) int: the faces of `mesh`; their corners, cells and offsets are the other parameters.
 
-    Attributes
-    ----------
-    points : (v, 3) float
-    walls : (v,) int
-        The set of walls that the vertex lies on, a row of `wall_sets`.
-    wall_sets : list of tuple of int
-        Walls, ascending; the first set is empty.
-    begin, count : (f,) int
-        The corners of face i are ``corners[begin[i]:begin[i] + count[i]]``, counter-clockwise as seen from outside of
-        the owner; none if the face is gone.
-    corners, codes : (k,) int
-        Vertices, and their packed offsets as the owner sees them.
-    owner, neighbor : (f,) int
-        Cells; -1 - k on wall k.
-    face_codes : (f,) int
-        Packed offset of the neighbor's image.
-    touched : (n,) bool
-        Cells that a merge has changed.
-    unwanted : (f,) bool
-        Faces that are collapsed whatever their size.
-    centroids : (n, 3) float
-        Where the cells had their centroids before all merges.
-    changed, edited : (f,) bool
-        Faces that a merge has changed, in this round and in any.
+    Its attributes:
+    - `points`: (v, 3) float
+    - `walls` (v,) int: the set of walls that the vertex lies on, a row of `wall_sets`.
+    - `wall_sets`: walls, ascending; the first set is empty.
+    - `begin`, `count` (f,) int: the corners of face i are ``corners[begin[i]:begin[i] + count[i]]``, counter-clockwise
+      as seen from outside of the owner; none if the face is gone.
+    - `corners`, `codes` (k,) int: vertices, and their packed offsets as the owner sees them.
+    - `owner`, `neighbor` (f,) int: cells; -1 - k on wall k.
+    - `face_codes` (f,) int: packed offset of the neighbor's image.
+    - `touched` (n,) bool: cells that a merge has changed.
+    - `unwanted` (f,) bool: faces that are collapsed whatever their size.
+    - `centroids` (n, 3) float: where the cells had their centroids before all merges.
+    - `changed`, `edited` (f,) bool: faces that a merge has changed, in this round and in any.
     """
 
     def __init__(

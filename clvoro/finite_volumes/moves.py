@@ -47,23 +47,15 @@ def least_bad(
     Bad cells near each other are a group. If it is less bad after a change, what changed in it stays; all else is
     changed back.
 
-    Parameters
-    ----------
-    first : object
-        The mesh of `state` (n, k): the generators, (n, 3), and more columns of numbers if it depends on these.
-    sizes : (n,) float
-        h at the generators.
-    badness : callable
-        Returns how bad the cells of each generator are in a mesh, (n + 1,) float, 0 for good ones. The last number is
-        that of cells without a generator.
-    change : callable
-        Called with the state, some rows (k,) int, and the number of the trial. Returns a state with those rows
-        changed, and those beside them; or the same one, for which no mesh is made.
-    remake : callable
-        Called with another state and the last mesh. Returns the mesh of that state, or None if there is none.
-    goes_on : list of bool
-        For each trial whether it changes the state of the one before at the cells that were bad then. Others change
-        the best state so far.
+    - `first`: the mesh of `state` (n, k): the generators, (n, 3), and more columns of numbers if it depends on these.
+    - `sizes` (n,) float: h at the generators.
+    - `badness`: returns how bad the cells of each generator are in a mesh, (n + 1,) float, 0 for good ones. The last
+      number is that of cells without a generator.
+    - `change`: called with the state, some rows (k,) int, and the number of the trial. Returns a state with those rows
+      changed, and those beside them; or the same one, for which no mesh is made.
+    - `remake`: called with another state and the last mesh. Returns the mesh of that state, or None if there is none.
+    - `goes_on`: for each trial whether it changes the state of the one before at the cells that were bad then. Others
+      change the best state so far.
     """
     best, last, bad, points = first, first, badness(first), state[:, :3]
     least, begun, given = bad.sum(), state, bad
@@ -143,16 +135,10 @@ def moved(
 
     The two generators of a pair, on both sides of a surface inside, are moved together along the surface.
 
-    Parameters
-    ----------
-    depth : callable
-        Returns how deep points (k, 3) are in the domain, (k,).
-    sizes : (n,) float
-        h at the generators.
-    move : int
-        The number of the trial, which the random directions depend on.
-    held : int
-        How many of the first generators stay.
+    - `depth`: returns how deep points (k, 3) are in the domain, (k,).
+    - `sizes` (n,) float: h at the generators.
+    - `move`: the number of the trial, which the random directions depend on.
+    - `held`: how many of the first generators stay.
     """
     beside = scipy.spatial.KDTree(points).query_ball_point(points[rows], _BESIDE * sizes[rows])
     rows, points = np.unique(np.concatenate(beside).astype(np.int64)), points.copy()

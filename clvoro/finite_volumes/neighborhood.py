@@ -19,32 +19,21 @@ VERTICES, CELLS, FACES = range(3)
 class Neighborhood:
     """The faces with a vertex of some sets, as they are after the merge, and all cells of these faces.
 
-    Attributes
-    ----------
-    faces, set_of_face : (f,) int
-        The faces, and for each one the set that has one of its vertices.
-    alive : (f,) bool
-        Faces that keep at least three corners.
-    starts : (f + 1,) int
-    corners, codes, face : (k,) int
-        Vertices at the corners of each face, their packed offsets, and the face as an index into `faces`.
-    new : (k,) int
-        Group of each corner that is a merged vertex; -1 for others.
-    after, before : (k,) int
-        Place of the next and of the previous corner of the same face.
-    cells, set_of_cell : (c,) int
-        The cells, and for each one the set of vertices whose merge changes it.
-    cells_of_face : (f, 2) int
-        Owner and neighbor of each face as indices into `cells`; -1 on walls.
-    side_starts : (c + 1,) int
-    side_face, side_cell : (s,) int
-        The faces of each cell, those that no merge changes included, as indices into those of `whole`; the cell.
-    side_star : (s,) int
-        Those of `faces` as indices into them; -1 for others.
-    side_sign : (s,) float
-        1 for the owner, -1 for the neighbor.
-    side_code : (s,) int
-        Packed offset of the face as seen from that cell.
+    - `faces`, `set_of_face` (f,) int: the faces, and for each one the set that has one of its vertices.
+    - `alive` (f,) bool: faces that keep at least three corners.
+    - `starts`: (f + 1,) int
+    - `corners`, `codes`, `face` (k,) int: vertices at the corners of each face, their packed offsets, and the face as
+      an index into `faces`.
+    - `new` (k,) int: group of each corner that is a merged vertex; -1 for others.
+    - `after`, `before` (k,) int: place of the next and of the previous corner of the same face.
+    - `cells`, `set_of_cell` (c,) int: the cells, and for each one the set of vertices whose merge changes it.
+    - `cells_of_face` (f, 2) int: owner and neighbor of each face as indices into `cells`; -1 on walls.
+    - `side_starts`: (c + 1,) int
+    - `side_face`, `side_cell` (s,) int: the faces of each cell, those that no merge changes included, as indices into
+      those of `whole`; the cell.
+    - `side_star` (s,) int: those of `faces` as indices into them; -1 for others.
+    - `side_sign` (s,) float: 1 for the owner, -1 for the neighbor.
+    - `side_code` (s,) int: packed offset of the face as seen from that cell.
     """
 
     def __init__(

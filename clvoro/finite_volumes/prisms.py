@@ -18,16 +18,10 @@ def polyhedra(mesh: Faces, thickness: float | None = None) -> Faces:
     The bottoms of the prisms follow the faces of `mesh`, then the tops. Bottom and top of cell i have the neighbors
     -1 - w and -2 - w, with w the number of walls of the domain.
 
-    Parameters
-    ----------
-    mesh : Faces
-    thickness : float, optional
-        In 2D: height of the prisms, whose bottoms are at z = 0. By default the mean width of a cell.
+    - `thickness`: in 2D: height of the prisms, whose bottoms are at z = 0. By default the mean width of a cell.
 
-    Raises
-    ------
-    InputError, InputTypeError
-        If `thickness` is not positive, or given in 3D; in 2D for a cell around an island or one that touches itself.
+    Raises `InputError` or `InputTypeError` if `thickness` is not positive, or given in 3D; in 2D for a cell around an
+    island or one that touches itself.
     """
     if mesh.dim == 3:
         if thickness is not None:
@@ -65,10 +59,7 @@ def polyhedra(mesh: Faces, thickness: float | None = None) -> Faces:
 def cell_loops(mesh: Faces) -> tuple[np.ndarray, np.ndarray]:
     """Return the corners of each cell in 2D as ragged rows, counter-clockwise: starts (n + 1,) and points.
 
-    Raises
-    ------
-    InputError
-        For a cell around an island, or one that touches itself.
+    Raises `InputError` for a cell around an island, or one that touches itself.
     """
     starts, loop, broken = simple_loops(mesh)
     if broken.size:

@@ -54,12 +54,8 @@ Loops = dict[int, list[Side]]
 def redivide(mesh: Faces, parts: np.ndarray) -> Faces:
     """Return `mesh` with the cells that OpenFOAM rejects, and those of a small determinant, divided anew if it helps.
 
-    Parameters
-    ----------
-    mesh : Faces
-        A mesh for solvers in 2D.
-    parts : (k,) int
-        Index of the named part of the boundary for each wall.
+    - `mesh`: a mesh for solvers in 2D.
+    - `parts` (k,) int: index of the named part of the boundary for each wall.
     """
     rejected = rejected_polygons(mesh) | (PlaneMeasures(mesh).determinant < WORST["determinant"])
     for _ in range(ROUNDS):
@@ -116,12 +112,8 @@ class _Change(NamedTuple):
 class _Edit:
     """Changes of single cells of a mesh, one after the other.
 
-    Attributes
-    ----------
-    points : list of (2,) float64
-        Those of the mesh, and new ones.
-    changed : Loops
-        The sides that cells have now.
+    - `points` list of (2,) float64: those of the mesh, and new ones.
+    - `changed`: the sides that cells have now.
     """
 
     def __init__(self, mesh: Faces, parts: np.ndarray) -> None:

@@ -21,10 +21,7 @@ def faces_with_seams(diagram: Diagram) -> Faces:
     For each periodic direction the faces on the upper side come first. A face that is shifted in several directions
     belongs to the first of them.
 
-    Raises
-    ------
-    ClvoroError
-        If a face exists on one side of a seam only.
+    Raises `ClvoroError` if a face exists on one side of a seam only.
     """
     faces, domain = diagram.faces, diagram.domain
     if not any(domain.periodic):

@@ -32,11 +32,7 @@ def collapse_short_edges(mesh: Faces, parts: np.ndarray) -> Faces:
     wall one takes the place of both. Inside, the middle of the face is tried first, then its ends. The images of a
     point at the seams of a periodic box move together.
 
-    Parameters
-    ----------
-    mesh : Faces
-    parts : (k,) int
-        Index of the named part of the boundary for each wall.
+    - `parts` (k,) int: index of the named part of the boundary for each wall.
     """
     failed = np.empty(0, np.int64)
     for _ in range(_ROUNDS):
@@ -54,25 +50,16 @@ def collapse_short_edges(mesh: Faces, parts: np.ndarray) -> Faces:
 class _Round:
     """Short faces that share no cell, and the points that move if they collapse.
 
-    Attributes
-    ----------
-    mesh : Faces
-    starts, loop, cell : int
-        Points around each cell as ragged rows, and the cell of each item.
-    images : (v,) int
-        Class of each point; points of a class are periodic images of one another.
-    kind : (v,) int
-        Free, on a wall, or in a corner.
-    faces : (e,) int
-        The shortest first.
-    a, b : (e,) int
-        Their ends.
-    face_of : (v,) int
-        Index in `faces` of the face that the point, or an image of it, is an end of; -1 for other points.
-    shift : (v, 2) int
-        By how many periods the point is away from that end.
-    into : (v,) int
-        The point that takes its place: where two ends of a face merge, one of them.
+    - `mesh`: Faces
+    - `starts`, `loop`, `cell`: points around each cell as ragged rows, and the cell of each item.
+    - `images` (v,) int: class of each point; points of a class are periodic images of one another.
+    - `kind` (v,) int: free, on a wall, or in a corner.
+    - `faces` (e,) int: the shortest first.
+    - `a`, `b` (e,) int: their ends.
+    - `face_of` (v,) int: index in `faces` of the face that the point, or an image of it, is an end of; -1 for other
+      points.
+    - `shift` (v, 2) int: by how many periods the point is away from that end.
+    - `into` (v,) int: the point that takes its place: where two ends of a face merge, one of them.
     """
 
     def __init__(self, mesh: Faces, parts: np.ndarray, failed: np.ndarray) -> None:

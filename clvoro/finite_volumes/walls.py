@@ -55,12 +55,8 @@ class RingCoordinate:
 
     The positions of a ring reach from that of its first vertex to that of the next ring's first vertex, without it.
 
-    Attributes
-    ----------
-    begins : (k + 1,) float64
-        Position of each vertex of `rings`, and the length of all rings.
-    ring_starts : (r + 1,) int64
-        First vertex of each ring.
+    - `begins` (k + 1,) float64: position of each vertex of `rings`, and the length of all rings.
+    - `ring_starts` (r + 1,) int64: first vertex of each ring.
     """
 
     def __init__(self, domain: Polygon) -> None:
@@ -99,13 +95,9 @@ class RingCoordinate:
 class ConvexFaces:
     """The faces between the convex cells of generators in the whole plane.
 
-    Attributes
-    ----------
-    left, right : (f,) int
-        Generators on both sides of the way from `begin` to `end`.
-    begin, end : (f,) int
-        Rows of `vertices`.
-    vertices : (v, 2) float64
+    - `left`, `right` (f,) int: generators on both sides of the way from `begin` to `end`.
+    - `begin`, `end` (f,) int: rows of `vertices`.
+    - `vertices`: (v, 2) float64
     """
 
     left: np.ndarray
@@ -154,13 +146,9 @@ def convex_faces(points: np.ndarray, weights: np.ndarray, extent: float) -> Conv
 def straight_walls(diagram: Diagram, domain: Polygon, parts: np.ndarray) -> Faces:
     """Return the mesh for solvers of `diagram` in `domain`; see the head of this module.
 
-    Parameters
-    ----------
-    diagram : Diagram
-    domain : Polygon
-        That of the diagram.
-    parts : (k,) int
-        Index of the named part of the boundary for each wall. A face on the boundary has walls of one part.
+    - `domain`: that of the diagram.
+    - `parts` (k,) int: index of the named part of the boundary for each wall. A face on the boundary has walls of one
+      part.
     """
     maker = _WallMaker(diagram, domain, parts)
     maker.place_vertices()
@@ -174,28 +162,17 @@ def straight_walls(diagram: Diagram, domain: Polygon, parts: np.ndarray) -> Face
 class _WallMaker:
     """The steps from convex cells to a mesh, and what they find.
 
-    Attributes
-    ----------
-    convex : ConvexFaces
-    size : (n,) float64
-        Square root of the area of each cell.
-    width : (f,) float64
-        The least size, or distance to another generator, of the two cells of each face.
-    least : (v,) float64
-        The least width of the faces at each vertex.
-    place : (v,) int
-        `INSIDE`, `ON` (the boundary) or `OUTSIDE`.
-    kept : (f,) bool
-        Whether a part of the face lies inside.
-    crossed : (f, 2) float64
-        Position on the boundary where the face ends, for both ends; nan for an end in a vertex.
-    ends : (f, 2) int
-        Points of the faces that are kept.
-    points : (p, 2) float64
-    position : (p,) float64
-        Position of points on the boundary; nan for others.
-    walls : tuple of (w,) int, (w,) int and (w, 2) int
-        Faces on the boundary: cells, walls, points.
+    - `convex`: ConvexFaces
+    - `size` (n,) float64: square root of the area of each cell.
+    - `width` (f,) float64: the least size, or distance to another generator, of the two cells of each face.
+    - `least` (v,) float64: the least width of the faces at each vertex.
+    - `place` (v,) int: `INSIDE`, `ON` (the boundary) or `OUTSIDE`.
+    - `kept` (f,) bool: whether a part of the face lies inside.
+    - `crossed` (f, 2) float64: position on the boundary where the face ends, for both ends; nan for an end in a vertex.
+    - `ends` (f, 2) int: points of the faces that are kept.
+    - `points`: (p, 2) float64
+    - `position` (p,) float64: position of points on the boundary; nan for others.
+    - `walls` tuple of (w,) int, (w,) int and (w, 2) int: faces on the boundary: cells, walls, points.
     """
 
     def __init__(self, diagram: Diagram, domain: Polygon, parts: np.ndarray) -> None:
@@ -423,10 +400,8 @@ class _WallMaker:
     def _close(self, cell: np.ndarray, gap: np.ndarray) -> np.ndarray:
         """Close gaps from points `gap[:, 0]` to `gap[:, 1]` of cells (g,), with corners of the domain between.
 
-        Returns
-        -------
-        left : (k,) int
-            Gaps that are left: their ends are on two rings, or in the opposite order.
+        Results:
+        - `left` (k,) int: gaps that are left: their ends are on two rings, or in the opposite order.
         """
         if not len(cell):
             return np.empty(0, np.int64)

@@ -42,14 +42,7 @@ class Time(NamedTuple):
 class FoamCase:
     """A folder with ``system`` and ``constant``, and a folder for each time.
 
-    Parameters
-    ----------
-    folder : path
-
-    Raises
-    ------
-    InputError
-        If it is no case.
+    Raises `InputError` if it is no case.
     """
 
     def __init__(self, folder: str | os.PathLike[str]) -> None:
@@ -71,10 +64,7 @@ class FoamCase:
     def held(self) -> Iterator[None]:
         """Hold the case: no other call changes it, nor the solver of a call that was killed, which holds it, too.
 
-        Raises
-        ------
-        InputError
-            If one of them does.
+        Raises `InputError` if one of them does.
         """
         if fcntl is None:
             yield
@@ -108,10 +98,7 @@ class FoamCase:
     def latest(self) -> Time:
         """Return the latest time.
 
-        Raises
-        ------
-        InputError
-            If none has been written.
+        Raises `InputError` if none has been written.
         """
         times = self.times()
         if not times:
@@ -123,10 +110,7 @@ class FoamCase:
     def mesh_folder(self, time: Time) -> Path:
         """Return the folder ``polyMesh`` that holds at a time: that of the latest time before it that has one.
 
-        Raises
-        ------
-        InputError
-            If there is no mesh.
+        Raises `InputError` if there is no mesh.
         """
         for earlier in reversed(self.times()):
             folder = self.folder / earlier.name / "polyMesh"
@@ -226,10 +210,7 @@ class FoamCase:
     def viscosity(self) -> float:
         """Return the kinematic viscosity, `nu` of ``constant/transportProperties``.
 
-        Raises
-        ------
-        InputError
-            If it is not there.
+        Raises `InputError` if it is not there.
         """
         path = self.folder / "constant" / "transportProperties"
         text = path.read_text() if path.exists() else ""
@@ -260,12 +241,7 @@ class FoamCase:
     def run(self, solver: str, log: Path) -> None:
         """Run a program of OpenFOAM in the case; what it prints goes into `log`.
 
-        Raises
-        ------
-        InputError
-            If it is not installed.
-        ClvoroError
-            If it fails; with the end of the log.
+        Raises `InputError` if it is not installed. Raises `ClvoroError` if it fails; with the end of the log.
         """
         words = check_solver(solver)
         environment = {"WM_PROJECT_DIR": _HOME, **os.environ}
@@ -290,10 +266,7 @@ class FoamCase:
 def check_solver(solver: str) -> list[str]:
     """Return the words of a command, whose first one is a program.
 
-    Raises
-    ------
-    InputError
-        If it is not installed.
+    Raises `InputError` if it is not installed.
     """
     words = solver.split()
     if not words or shutil.which(words[0]) is None:

@@ -27,25 +27,14 @@ def project_fluxes(mesh: FoamMesh, velocity: np.ndarray, at_boundary: np.ndarray
     The velocity is interpolated to the faces, and the gradient of a potential q is subtracted from it, which solves
     ``sum over faces of (A / d) (q_j - q_i) = sum of the fluxes out of cell i``, with q = 0 beyond open faces.
 
-    Parameters
-    ----------
-    mesh : FoamMesh
-    velocity : (n, 3) float64
-        In the cells.
-    at_boundary : (b,) float64
-        Fluxes through the faces of the boundary, out of the domain. If none of them is open, those that leave
-        the domain are scaled to the sum of those that enter.
-    is_open : (b,) bool
-        Faces whose flux is free.
+    - `velocity` (n, 3) float64: in the cells.
+    - `at_boundary` (b,) float64: fluxes through the faces of the boundary, out of the domain. If none of them is open,
+      those that leave the domain are scaled to the sum of those that enter.
+    - `is_open` (b,) bool: faces whose flux is free.
 
-    Returns
-    -------
-    (f,) float64
+    The result is (f,) float64.
 
-    Raises
-    ------
-    InputError
-        If none of them is open, and what enters does not leave.
+    Raises `InputError` if none of them is open, and what enters does not leave.
     """
     check_balance(mesh, velocity, at_boundary, is_open)
     centers, areas = mesh.faces

@@ -215,16 +215,10 @@ def _zones(folder: Path, name: str) -> dict[str, np.ndarray]:
 def polygon_of_edges(points: np.ndarray, ends: np.ndarray, names: list[str]) -> Polygon:
     """Return the polygon whose boundary is made of edges; straight runs of edges with one name become one edge.
 
-    Parameters
-    ----------
-    points : (v, 2) float
-    ends : (k, 2) int
-    names : list of k str
+    - `points`: (v, 2) float
+    - `ends`: (k, 2) int
 
-    Raises
-    ------
-    InputError
-        If they do not close.
+    Raises `InputError` if they do not close.
     """
     # Both sides of a baffle have vertices of their own at the same points.
     grid = (points / (1e-9 * np.ptp(points, axis=0).max())).round()

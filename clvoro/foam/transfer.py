@@ -33,13 +33,10 @@ _VOLUME_FLUX = (0.0, 3.0, -1.0)
 class MeshOfCase:
     """The mesh of a case, as OpenFOAM's and as a diagram.
 
-    Attributes
-    ----------
-    foam : FoamMesh
-    diagram : Diagram
-    row : (c,) int
-        The cell of the diagram to which each cell of OpenFOAM belongs: where cells are merged or divided at walls, not
-        all have one of their own.
+    - `foam`: FoamMesh
+    - `diagram`: Diagram
+    - `row` (c,) int: the cell of the diagram to which each cell of OpenFOAM belongs: where cells are merged or divided
+      at walls, not all have one of their own.
     """
 
     foam: FoamMesh
@@ -79,10 +76,7 @@ class MeshOfCase:
 
         Regions of the domain are left out, since the new mesh has them by itself.
 
-        Raises
-        ------
-        InputError
-            If a zone has none of the new cells.
+        Raises `InputError` if a zone has none of the new cells.
         """
         known = () if new.domain.borders is None else new.region_names
         zones = {name: rows for name, rows in self.foam.zones.items() if name not in known}
@@ -101,10 +95,7 @@ class MeshOfCase:
 def entries_at(field: FoamField, patch: FoamPatchFaces) -> Entries:
     """Return the entries of a field for a patch: by its name, else by a group, else by the last pattern that fits.
 
-    Raises
-    ------
-    InputError
-        If there are none.
+    Raises `InputError` if there are none.
     """
     # A patch is also in the group of its type, such as "wall".
     for name in (patch.name, *patch.groups, patch.kind):

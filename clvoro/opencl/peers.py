@@ -54,20 +54,14 @@ class Peers:
     While a mesh has few cells, only the first parts work (`lead`). The others are alone, and rest until part 0 calls
     them.
 
-    Attributes
-    ----------
-    number, count, size : int
-        Number of this part; number of parts that work together, 1 if this part rests; number of all parts.
-    rests : bool
-        Whether this part has no work.
-    shared : bool
-        Whether the run is one over ranks, be it a single one. The faces of a cell are then in the order of the
-        permanent numbers of its neighbors.
-    gathers : bool
-        Whether this part gathers the mesh of all parts at the end of each run.
-    exchanges, reductions, waits : int
-        How often this part has exchanged arrays, gathered values and waited so far. `swap` counts as an exchange, and
-        with `values` as a gather, too.
+    - `number`, `count`, `size`: number of this part; number of parts that work together, 1 if this part rests; number
+      of all parts.
+    - `rests`: whether this part has no work.
+    - `shared`: whether the run is one over ranks, be it a single one. The faces of a cell are then in the order of the
+      permanent numbers of its neighbors.
+    - `gathers`: whether this part gathers the mesh of all parts at the end of each run.
+    - `exchanges`, `reductions`, `waits`: how often this part has exchanged arrays, gathered values and waited so far.
+      `swap` counts as an exchange, and with `values` as a gather, too.
     """
 
     number, count, size, shared, gathers, rests = 0, 1, 1, False, False, False
@@ -122,12 +116,8 @@ class Peers:
 
         `describe` names values of the result. They must be the same in all parts, and so must the version of clvoro.
 
-        Raises
-        ------
-        InputError
-            On part 0, if values differ; the message names the first one.
-        RankError
-            On the other parts, if values differ; or if `prepare` has raised an error in another part.
+        Raises `InputError` on part 0, if values differ; the message names the first one. Raises `RankError` on the
+        other parts, if values differ; or if `prepare` has raised an error in another part.
         """
         if self.count == 1:
             return prepare()
@@ -201,14 +191,7 @@ ALONE = Peers()
 class Ranks(Peers):
     """The ranks of an MPI communicator. It is duplicated, so all of its ranks create this object together.
 
-    Parameters
-    ----------
-    comm : mpi4py.MPI.Comm
-
-    Raises
-    ------
-    InputTypeError
-        If `comm` is no communicator.
+    Raises `InputTypeError` if `comm` is no communicator.
     """
 
     shared = True
@@ -358,10 +341,7 @@ def peers_of(comm: object) -> Peers:
 
     None stands for a domain in one part. All ranks call this together.
 
-    Raises
-    ------
-    InputTypeError
-        If `comm` is something else.
+    Raises `InputTypeError` if `comm` is something else.
     """
     return ALONE if comm is None else comm if isinstance(comm, Peers) else Ranks(comm)
 

@@ -35,10 +35,7 @@ class _Table:
     def hand_over(self, number: int, given: Any, count: int) -> list[Any]:
         """Give an object as thread `number`, and return the objects of the first `count` threads in their order.
 
-        Raises
-        ------
-        RankError
-            If the table has been closed.
+        Raises `RankError` if the table has been closed.
         """
         with self._changed:
             turn = self._rounds
@@ -150,17 +147,11 @@ class Threads(Peers):
 class Team:
     """Threads, one for each part, that do their work together.
 
-    Parameters
-    ----------
-    count : int
-        Number of threads.
+    - `count`: number of threads.
 
-    Attributes
-    ----------
-    peers : tuple of Threads
-        The parts of the domain as each thread sees them.
-    interrupted : bool
-        Whether the user has pressed Ctrl-C since they began to work.
+    Its attributes:
+    - `peers`: the parts of the domain as each thread sees them.
+    - `interrupted`: whether the user has pressed Ctrl-C since they began to work.
     """
 
     def __init__(self, count: int) -> None:
@@ -181,11 +172,8 @@ class Team:
         Warnings of the first part are given in the thread that calls this. The others have the same ones, which are
         left out. After Ctrl-C `interrupted` is True, and `work` should end soon; a second Ctrl-C ends it.
 
-        Raises
-        ------
-        BaseException
-            The first error of a thread, after all threads have ended. A `RankError` is raised only if there is no other
-            error.
+        Raises the first error of a thread after all threads have ended. A `RankError` is raised only
+        if there is no other error.
         """
         calls: _Calls = queue.SimpleQueue()
         table, results = _Table(len(self.peers)), [None] * len(self.peers)

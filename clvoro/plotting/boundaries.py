@@ -144,11 +144,8 @@ def _pieces(corners: np.ndarray, wall: np.ndarray, domain: Domain) -> tuple[np.n
 def _places(flat: np.ndarray, wall: np.ndarray, domain: Domain) -> dict[int, np.ndarray]:
     """Return for walls that are seen a place (2,) in the middle of the part that is.
 
-    Parameters
-    ----------
-    flat : (k, 3, 2) float
-        Pieces of walls, those nearer to the viewer later.
-    wall : (k,) int
+    - `flat` (k, 3, 2) float: pieces of walls, those nearer to the viewer later.
+    - `wall`: (k,) int
     """
     middle = flat.mean(axis=1)
     pixel = np.floor(middle * (_PARTS / float(domain.extent.max()))).astype(int)

@@ -166,9 +166,7 @@ class DiagramPicture:
 def picture_of(mesh: Result | Diagram) -> Result:
     """Return a result as it is, and a diagram as a `Result`-like object.
 
-    Raises
-    ------
-    InputTypeError
+    Raises `InputTypeError`.
     """
     if isinstance(mesh, Diagram):
         return cast("Result", DiagramPicture(mesh))
@@ -241,10 +239,8 @@ def paint_of(
 
     Without `limits` the cells `seen` set the scale.
 
-    Raises
-    ------
-    InputError, InputTypeError
-        If there is no such color, or the array has another shape or no real numbers.
+    Raises `InputError` or `InputTypeError` if there is no such color, or the array has another shape or no real
+    numbers.
     """
     if isinstance(color, str):
         if isinstance(result, DiagramPicture) and color in _OF_RUNS:

@@ -214,11 +214,9 @@ def _pair(name: str, value: Any) -> tuple[float, float]:
 def outlines(diagram: Diagram) -> tuple[np.ndarray, np.ndarray]:
     """Return the outlines of the cells with short steps along their arcs.
 
-    Returns
-    -------
-    starts : (n + 1,) int
-    points : (p, 3) float
-        Unit vectors, ``points[starts[i]:starts[i + 1]]`` counter-clockwise around cell i.
+    Results:
+    - `starts`: (n + 1,) int
+    - `points` (p, 3) float: unit vectors, ``points[starts[i]:starts[i + 1]]`` counter-clockwise around cell i.
     """
     corners = diagram.vertices[diagram.cell_vertices]
     starts = diagram.cell_vertex_starts

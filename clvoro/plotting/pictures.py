@@ -83,14 +83,9 @@ def pictures_of(
 ) -> list[Picture]:
     """List the pictures of `results`; nothing is drawn yet.
 
-    Parameters
-    ----------
-    results : mapping
-        Results by the method's name, all from one start; the last is the main one.
-    initial : Result, optional
-        The mesh before the first step.
-    size : callable, optional
-        The size field h(points (n, 2)); without it, and in 3D, the sizes at the generators are shown.
+    - `results`: results by the method's name, all from one start; the last is the main one.
+    - `initial`: the mesh before the first step.
+    - `size`: the size field h(points (n, 2)); without it, and in 3D, the sizes at the generators are shown.
     """
     name, main = list(results.items())[-1]
     panels = {**({"initial": initial} if initial is not None else {}), **results}
@@ -152,12 +147,8 @@ def render(figure: Any, kind: str = "png", dpi: int = 170) -> bytes:
 def plot_side_by_side(panels: Mapping[str, Result], paint: Paint, color: str, columns: int) -> Any:
     """Draw meshes side by side with one scale, on a new figure; the last one says which part is in the middle.
 
-    Parameters
-    ----------
-    panels : mapping
-        Results by their titles, in one domain.
-    paint : Paint
-        The scale, and the values of all.
+    - `panels`: results by their titles, in one domain.
+    - `paint`: the scale, and the values of all.
     """
     *_, main = panels.values()
     domain = main.diagram.domain

@@ -388,12 +388,10 @@ def visible_faces(
 ) -> tuple[np.ndarray, list[np.ndarray], np.ndarray]:
     """Return the faces of the kept cells that face the viewer, the farthest first.
 
-    Returns
-    -------
-    cells : (f,) int
-        The cell of each face.
-    polygons : list of (c, 3) float
-    normals : (f, 3) float
+    Results:
+    - `cells` (f,) int: the cell of each face.
+    - `polygons`: list of (c, 3) float
+    - `normals`: (f, 3) float
     """
     domain, neighbor = diagram.domain, np.maximum(diagram.neighbors, 0)
     low, high = _bounds(diagram, diagram.vertices) if any(domain.periodic) else (diagram.points, diagram.points)

@@ -22,10 +22,7 @@ _MAX_GROWTH = 10  # a larger value is meant as a percentage
 def check_positive(what: str, value: object) -> float:
     """Return `value` as a float.
 
-    Raises
-    ------
-    InputError, InputTypeError
-        If it is not a positive, finite number.
+    Raises `InputError` or `InputTypeError` if it is not a positive, finite number.
     """
     if not isinstance(value, Real) or isinstance(value, (bool, np.bool_)):
         raise InputTypeError(f"{what} is {value!r}, expected a positive number")
@@ -41,10 +38,7 @@ def check_positive(what: str, value: object) -> float:
 def check_slope(what: str, growth: object, slope: object) -> float:
     """Return the slope dh/dx, which is given itself or by the growth rate per cell as ln(growth).
 
-    Raises
-    ------
-    InputError
-        If both or none are given, or the value is out of range.
+    Raises `InputError` if both or none are given, or the value is out of range.
     """
     if (growth is None) == (slope is None):
         raise InputError(f"{what} got growth={growth} and slope={slope}, expected exactly one of them")
@@ -70,12 +64,8 @@ _LEAST_COVERED = 0.5
 def advice_for_size(value: float, domain: Domain, on_device: bool, most: float = math.inf) -> str:
     """Return how to correct a size field on `domain` that has the invalid size `value`.
 
-    Parameters
-    ----------
-    on_device : bool
-        Whether the field runs on the device (see `Field`), or is a Python function.
-    most : float
-        Largest valid size.
+    - `on_device`: whether the field runs on the device (see `Field`), or is a Python function.
+    - `most`: largest valid size.
     """
     if math.isnan(value):
         by = "fmax(x, 0)" if on_device else "numpy.where or numpy.nan_to_num"

@@ -21,19 +21,13 @@ if TYPE_CHECKING:
 class CodeWriter:
     """Collects the statements of `size_at` and the numbers that they read.
 
-    Attributes
-    ----------
-    dim : int
-    origin : (d,) float
-    scale : float
-        The device sees x' = (x - origin) / scale and h' = h / scale.
-    real : numpy.dtype
-        Precision in which the device reads the numbers.
-    domain : Box, Polygon, Sphere or Solid
-    engine : Engine or None
-        Engine for fields that are computed in advance; None for the default device.
-    peak_bytes : int
-        Device memory that this computation took at most.
+    - `dim`: int
+    - `origin`: (d,) float
+    - `scale`: the device sees x' = (x - origin) / scale and h' = h / scale.
+    - `real`: precision in which the device reads the numbers.
+    - `domain`: Box, Polygon, Sphere or Solid
+    - `engine`: engine for fields that are computed in advance; None for the default device.
+    - `peak_bytes`: device memory that this computation took at most.
     """
 
     def __init__(self, domain: Domain, real: np.dtype, engine: Engine | None = None):

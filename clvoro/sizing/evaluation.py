@@ -184,10 +184,7 @@ class Sizing:
     def __call__(self, points: np.ndarray) -> np.ndarray:
         """Return h (n,) float64 at physical `points` (n, d) on the host, computed on the device.
 
-        Raises
-        ------
-        SizeFieldError
-            If a value is not positive and finite.
+        Raises `SizeFieldError` if a value is not positive and finite.
         """
         if self._kernels is None:
             return self._on_host(np.asarray(points, dtype=float))

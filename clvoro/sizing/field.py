@@ -51,20 +51,11 @@ class Field:
     def __call__(self, points: object) -> np.ndarray:
         """Return h at `points`.
 
-        Parameters
-        ----------
-        points : (n, d) float
-            Physical coordinates.
+        - `points` (n, d) float: physical coordinates.
 
-        Returns
-        -------
-        (n,) float64
-            Sizes, in the unit of the coordinates.
+        The result is (n,) float64: sizes, in the unit of the coordinates.
 
-        Raises
-        ------
-        InputError
-            If `points` does not have the shape (n, d) with the field's d.
+        Raises `InputError` if `points` does not have the shape (n, d) with the field's d.
         """
         try:
             array = np.asarray(points, dtype=float)
@@ -345,10 +336,7 @@ def _fold_constants(operation: str, fields: Sequence[Field]) -> Field:
 def count_parts(*fields: Field) -> int:
     """Return the number of parts of a combination of `fields`.
 
-    Raises
-    ------
-    InputError
-        If there are too many to build kernels.
+    Raises `InputError` if there are too many to build kernels.
     """
     parts = sum(f.parts for f in fields)
     if parts > _MAX_PARTS:

@@ -26,13 +26,9 @@ def globe_columns(least: float) -> int:
 class Gradation:
     """Lower the values on a grid until their gradient is bounded.
 
-    Parameters
-    ----------
-    engine : Engine
-        Of the dimension of the grid.
-    globe : bool
-        Whether the grid is one of longitude and latitude around a sphere, with nodes at the centers of pixels. Then it
-        has `globe_columns` values along a row, and the spacing along x is that at the equator.
+    - `engine`: of the dimension of the grid.
+    - `globe`: whether the grid is one of longitude and latitude around a sphere, with nodes at the centers of pixels.
+      Then it has `globe_columns` values along a row, and the spacing along x is that at the equator.
     """
 
     def __init__(self, engine: Engine, globe: bool = False):
@@ -46,21 +42,12 @@ class Gradation:
 
         Fast sweeping within tiles, which become active in the order of their values.
 
-        Parameters
-        ----------
-        values : device array of real, (prod(counts),)
-            Positive; x runs fastest.
-        counts : d ints
-            Number of nodes along x, y (, z).
-        spacing : d floats
-            Distance of the nodes along each axis, in the unit of the values.
-        slope : float
-            Not negative.
+        - `values` device array of real, (prod(counts),): positive; x runs fastest.
+        - `counts`: number of nodes along x, y (, z).
+        - `spacing`: distance of the nodes along each axis, in the unit of the values.
+        - `slope`: not negative.
 
-        Returns
-        -------
-        int
-            Passes over the tiles.
+        Return the number of passes over the tiles.
         """
         engine, kernels = self.engine, self._kernels
         tiles = tuple(-(-n // self._tile) for n in counts)

@@ -27,10 +27,7 @@ def check_p(what: str, p: object) -> None:
 def check_one_of(what: str, n_cells: object, eps: object) -> float:
     """Return the one that is given.
 
-    Raises
-    ------
-    InputError, InputTypeError
-        If both or none are, or it is not positive.
+    Raises `InputError` or `InputTypeError` if both or none are, or it is not positive.
     """
     if (n_cells is None) == (eps is None):
         raise InputError(f"{what} got n_cells={n_cells} and eps={eps}, expected exactly one of them")
@@ -41,10 +38,7 @@ def check_one_of(what: str, n_cells: object, eps: object) -> float:
 def check_bounds(what: str, h_min: object, h_max: object, longest: float) -> float:
     """Return the largest size: `h_max`, at most `longest`, at least `h_min`.
 
-    Raises
-    ------
-    InputError, InputTypeError
-        If the bounds are not numbers in order.
+    Raises `InputError` or `InputTypeError` if the bounds are not numbers in order.
     """
     for name, bound in (("h_min", h_min), ("h_max", h_max)):
         if not isinstance(bound, Real) or isinstance(bound, bool):
@@ -114,15 +108,9 @@ def scale_profile(
 ) -> np.ndarray:
     """Return factor * profile within the bounds. Without a factor, find the one that gives `n_cells`.
 
-    Parameters
-    ----------
-    profile : array
-        Infinite where sizes are largest.
+    - `profile`: infinite where sizes are largest.
 
-    Raises
-    ------
-    InputError
-        If no factor gives `n_cells`.
+    Raises `InputError` if no factor gives `n_cells`.
     """
     if n_cells is not None and not np.isfinite(profile).any():
         raise InputError(f"{what} {_NOTHING}, so n_cells={n_cells:g} cannot be distributed; use a number as size")

@@ -27,21 +27,12 @@ _MAX_NODES = 1 << 22  # of a raster, by default
 def fill_missing(what: str, values: Any, missing: str, spacing: np.ndarray) -> np.ndarray:
     """Return `values` as floats without missing ones.
 
-    Parameters
-    ----------
-    what : str
-        Name of the values in errors.
-    values : array of real numbers, (ny, nx) or (nz, ny, nx)
-        NaN and masked values are missing.
-    missing : "error" or "nearest"
-        Whether missing values are rejected or filled with the nearest value.
-    spacing : (d,) float
-        Spacing of the values along x, y (, z), for the nearest value.
+    - `what`: name of the values in errors.
+    - `values` array of real numbers, (ny, nx) or (nz, ny, nx): NaN and masked values are missing.
+    - `missing` "error" or "nearest": whether missing values are rejected or filled with the nearest value.
+    - `spacing` (d,) float: spacing of the values along x, y (, z), for the nearest value.
 
-    Raises
-    ------
-    InputError
-        If a value is infinite, all are missing, or some are and `missing` is "error".
+    Raises `InputError` if a value is infinite, all are missing, or some are and `missing` is "error".
     """
     if missing not in ("error", "nearest"):
         raise InputError(f"{what} got missing={missing!r}, expected 'error' or 'nearest'")
@@ -387,10 +378,7 @@ def check_box(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the corners of a raster of `shape` as arrays (d,).
 
-    Raises
-    ------
-    InputError
-        If they do not match the shape, or are not in order.
+    Raises `InputError` if they do not match the shape, or are not in order.
     """
     if len(shape) not in (2, 3) or 0 in shape:
         raise InputError(f"{what} values have shape {shape}, expected (ny, nx) or (nz, ny, nx), not empty")

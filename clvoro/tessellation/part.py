@@ -39,23 +39,14 @@ SUMS = 256
 class Ghosts:
     """Who owns the g ghosts of a part: what fills their values.
 
-    Attributes
-    ----------
-    rows : (>= g,) int32, device
-        Row of the owner in its part; -1 for a ghost without owner.
-    codes : (>= g,) int32, device, optional
-        Codes of periodic images: the sum over the axes a of (c + 1) 3^a, where the image is shifted by c periods, c =
-        -1, 0 or 1.
-    firsts : (n_own + 1,) int32, device, optional
-        The images of generator i begin at ``firsts[i]``.
-    peers : Peers, optional
-        If owners are in other parts. Ghosts are then in the order of these.
-    parts : (g,) int
-        With `peers`, the part of each owner, on the host.
-    sent : (s,) int32, device
-        Rows of this part whose values others need, part by part.
-    sent_counts, counts : (p,) int
-        How many rows each part needs, and how many ghosts it owns.
+    - `rows` (>= g,) int32, device: row of the owner in its part; -1 for a ghost without owner.
+    - `codes` (>= g,) int32, device: codes of periodic images: the sum over the axes a of (c + 1) 3^a, where the image
+      is shifted by c periods, c = -1, 0 or 1.
+    - `firsts` (n_own + 1,) int32, device: the images of generator i begin at ``firsts[i]``.
+    - `peers`: if owners are in other parts. Ghosts are then in the order of these.
+    - `parts` (g,) int: with `peers`, the part of each owner, on the host.
+    - `sent` (s,) int32, device: rows of this part whose values others need, part by part.
+    - `sent_counts`, `counts` (p,) int: how many rows each part needs, and how many ghosts it owns.
     """
 
     rows: cla.Array
@@ -131,22 +122,15 @@ def follow_images(
 class Part:
     """Generators with cells and unknowns, and ghosts that only shape cells, on the device.
 
-    Attributes
-    ----------
-    n_own, count : int
-        Number of generators with cells; number of generators and ghosts.
-    points : (>= count, d) real
-        In the device's coordinates, ghosts last. In a power diagram rows end with weights.
-    box : ClipBox
-        Contains all of them, and clips cells.
-    ghosts : Ghosts, optional
-        None if the ghosts have no values, or there are none.
-    halo_args : tuple
-        What kernels need to test whether the ghosts are enough: HALO_ARGS in a periodic box (periodic/halo.h).
-    labels : (count,) int32, optional
-        Permanent names of the generators. The faces of a cell are then in the order of labels, and its measures are
-        summed in this order: they have the same bits in all parts that have the cell. A periodic image has the label of
-        its owner, so that no cell may be a neighbor of two images of one generator.
+    - `n_own`, `count`: number of generators with cells; number of generators and ghosts.
+    - `points` (>= count, d) real: in the device's coordinates, ghosts last. In a power diagram rows end with weights.
+    - `box`: contains all of them, and clips cells.
+    - `ghosts`: None if the ghosts have no values, or there are none.
+    - `halo_args`: what kernels need to test whether the ghosts are enough: HALO_ARGS in a periodic box
+      (periodic/halo.h).
+    - `labels` (count,) int32: permanent names of the generators. The faces of a cell are then in the order of labels,
+      and its measures are summed in this order: they have the same bits in all parts that have the cell. A periodic
+      image has the label of its owner, so that no cell may be a neighbor of two images of one generator.
     """
 
     n_own: int
@@ -213,26 +197,17 @@ class Part:
     ) -> np.ndarray:
         """Return sums over own cells that prove, with those of all parts, that `t` is a part of the whole diagram.
 
-        Parameters
-        ----------
-        at, limits : (n_own, d) real, (n_own, 2) float32
-            Of each generator an earlier position, the radius around it within which all generators are known, and how
-            far the generator may move from it.
-        factor : float
-            Radius of the ball in which all generators must be known, over the reach of a cell.
-        with_ghosts : bool
-            Whether the cells of ghosts beside own cells must be final, too.
-        needed : (n_own,) float32
-            Receives the radii of the balls around own generators in which all generators must be known.
-        periods : (4,) real
-            Lengths of the periods; 0 between walls.
+        - `at`, `limits` (n_own, d) real, (n_own, 2) float32: of each generator an earlier position, the radius around
+          it within which all generators are known, and how far the generator may move from it.
+        - `factor`: radius of the ball in which all generators must be known, over the reach of a cell.
+        - `with_ghosts`: whether the cells of ghosts beside own cells must be final, too.
+        - `needed` (n_own,) float32: receives the radii of the balls around own generators in which all generators must
+          be known.
+        - `periods` (4,) real: lengths of the periods; 0 between walls.
 
-        Returns
-        -------
-        (5,) ndarray
-            The volume of own cells; the signed sum of the measures of their faces with ghosts; the sum without signs;
-            the numbers of generators beyond their limits, and of neighbors half a period away or farther. The signed
-            sums of all parts add up to zero if each face between two parts has both sides.
+        The result is (5,) ndarray: the volume of own cells; the signed sum of the measures of their faces with ghosts;
+        the sum without signs; the numbers of generators beyond their limits, and of neighbors half a period away or
+        farther. The signed sums of all parts add up to zero if each face between two parts has both sides.
         """
         sums = engine.scratch((SUMS, 5))
         given = t.starts, t.neighbors, self.labels, t.face_measures, t.volumes

@@ -91,25 +91,16 @@ def _nearest_ahead(points: np.ndarray) -> np.ndarray:
 class Chunks:
     """The generators of a part, divided into chunks: runs of a Hilbert curve through the cells of a grid.
 
-    Parameters
-    ----------
-    points : (n, d) float
-        In the order of bins.
-    least : float
-        Lower bound of `spacings`.
+    - `points` (n, d) float: in the order of bins.
+    - `least`: lower bound of `spacings`.
 
-    Attributes
-    ----------
-    order : (n,) int
-        Generators chunk by chunk.
-    firsts : (k,) int
-        Where the chunks begin.
-    groups : (n,) int
-        The chunk of each generator.
-    spacings : (n,) float
-        An estimate of the spacing around each generator. A run of `RUN` generators has the median of their distances
-        from the nearest of the next `AHEAD`, in the order of chunks or of bins; the estimate is the largest of three
-        runs, that of the generator and the two beside it.
+    Its attributes:
+    - `order` (n,) int: generators chunk by chunk.
+    - `firsts` (k,) int: where the chunks begin.
+    - `groups` (n,) int: the chunk of each generator.
+    - `spacings` (n,) float: an estimate of the spacing around each generator. A run of `RUN` generators has the median
+      of their distances from the nearest of the next `AHEAD`, in the order of chunks or of bins; the estimate is the
+      largest of three runs, that of the generator and the two beside it.
     """
 
     def __init__(self, points: np.ndarray, least: float) -> None:
@@ -139,18 +130,12 @@ class Chunks:
 class BallGroups:
     """The balls in which a part has to know all generators. The balls around the generators of a chunk are a group.
 
-    Parameters
-    ----------
-    centers : (n, d) float
-    radii : (n,) float
-    chunks : Chunks
+    - `centers`: (n, d) float
+    - `radii`: (n,) float
 
-    Attributes
-    ----------
-    boxes : (k, 2 d) float
-        Lower and upper corners of boxes around the centers of each group.
-    facts : (k, 2 d + 2) float
-        What other parts have to know: the boxes, the largest radius and the smallest skin.
+    Its attributes:
+    - `boxes` (k, 2 d) float: lower and upper corners of boxes around the centers of each group.
+    - `facts` (k, 2 d + 2) float: what other parts have to know: the boxes, the largest radius and the smallest skin.
     """
 
     def __init__(self, centers: np.ndarray, radii: np.ndarray, chunks: Chunks) -> None:
@@ -200,15 +185,11 @@ class BallGroups:
 class Facing:
     """The balls of a part that are near boxes of another part.
 
-    Attributes
-    ----------
-    facts : (m, 2 d + 2) float
-        Facts about the groups of the other part; see `BallGroups`.
-    away : (n,) float
-        Lower bound of the distance of each ball's center from the boxes with which it has no pairs. This distance is
-        also at least `NEAR` times the largest radius in such a box.
-    places, others, ways : (p,) int, int, float
-        Pairs of a ball and a box in the order of balls, and the distances of the ball's center from this box.
+    - `facts` (m, 2 d + 2) float: facts about the groups of the other part; see `BallGroups`.
+    - `away` (n,) float: lower bound of the distance of each ball's center from the boxes with which it has no pairs.
+      This distance is also at least `NEAR` times the largest radius in such a box.
+    - `places`, `others`, `ways` (p,) int, int, float: pairs of a ball and a box in the order of balls, and the
+      distances of the ball's center from this box.
     """
 
     facts: np.ndarray
@@ -222,19 +203,12 @@ class Facing:
 class Answers:
     """The answers of one round of requests, in which each part asks the others for generators.
 
-    Attributes
-    ----------
-    balls : BallGroups
-        Those of this part.
-    asked : (m,) int
-        Numbers of those that may contain generators that this part does not know.
-    facing : dict of Facing
-        By the numbers of the other parts, or in a periodic box of the images of all parts.
-    given : list of (k,) int32
-        The own generators in the balls of each of these that it did not know before.
-    new : list of (k, d + 3) float
-        The generators that each part has given: their rows in that part, whether cells of this part need them, their
-        positions (of the image, in a periodic box), and the number of the image.
+    - `balls`: those of this part.
+    - `asked` (m,) int: numbers of those that may contain generators that this part does not know.
+    - `facing`: by the numbers of the other parts, or in a periodic box of the images of all parts.
+    - `given` list of (k,) int32: the own generators in the balls of each of these that it did not know before.
+    - `new` list of (k, d + 3) float: the generators that each part has given: their rows in that part, whether cells of
+      this part need them, their positions (of the image, in a periodic box), and the number of the image.
     """
 
     balls: BallGroups
@@ -307,12 +281,8 @@ class PartSteps(DomainSteps):
 
     Ghosts are kept from one diagram of the same generators to the next.
 
-    Attributes
-    ----------
-    rounds : int
-        How often the cells of the latest diagram have been made.
-    asked : int
-        How often parts have asked each other for ghosts.
+    - `rounds`: how often the cells of the latest diagram have been made.
+    - `asked`: how often parts have asked each other for ghosts.
     """
 
     def __init__(
@@ -590,12 +560,8 @@ class PartSteps(DomainSteps):
     def _ask(self, x: np.ndarray, radii: np.ndarray, needed: np.ndarray) -> Answers:
         """Ask for the generators in balls around own generators.
 
-        Parameters
-        ----------
-        x : (n, d) float
-            Positions of the generators.
-        radii, needed : (n,) float
-            Radii of the balls to ask for, and of the balls that the present cells need.
+        - `x` (n, d) float: positions of the generators.
+        - `radii`, `needed` (n,) float: radii of the balls to ask for, and of the balls that the present cells need.
         """
         self.asked += 1
         peers, balls, ways = self.peers, BallGroups(x, radii, self._chunks), len(self._shifts)

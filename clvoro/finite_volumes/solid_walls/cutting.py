@@ -51,18 +51,11 @@ class CellCut:
     Vertices near the plane count as in it, and as above. So the section, the polygon in which the plane cuts the cell,
     crosses only edges of the cell with one end below.
 
-    Parameters
-    ----------
-    edits : Edits
-        Which the cut changes.
-    cell : int
-    edge : (int, int)
-    below : int
-        The face right of the edge; it is on the lower side.
-    normal : (3,) float
-        Of the plane, upward.
-    near : float
-        Vertices nearer to the plane than this are in it.
+    - `edits`: which the cut changes.
+    - `edge`: (int, int)
+    - `below`: the face right of the edge; it is on the lower side.
+    - `normal` (3,) float: of the plane, upward.
+    - `near`: vertices nearer to the plane than this are in it.
     """
 
     def __init__(self, edits: Edits, cell: int, edge: Edge, below: int, normal: np.ndarray, near: float) -> None:

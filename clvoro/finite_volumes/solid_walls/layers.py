@@ -60,24 +60,15 @@ def add_layers(diagram: Diagram, layers: Sequence[Layers]) -> tuple[Diagram, lis
     Layers are thinner in gaps, and where cells would be invalid. They taper to nothing where they cannot end on a patch
     without layers, or where patches meet at a sharp edge.
 
-    Parameters
-    ----------
-    diagram : Diagram
-        Of a `Solid`.
-    layers : sequence of Layers
-        As `check_extruded` accepts them.
+    - `diagram`: of a `Solid`.
+    - `layers`: as `check_extruded` accepts them.
 
-    Returns
-    -------
-    diagram : Diagram
-        The cells of `diagram`, then the prisms, polygon by polygon, the innermost first. Its `layer` says which one.
-    thickness : list of dict
-        How thick each of `layers` is; see `clvoro.mesh.results.thickness_in_words`.
+    Results:
+    - `diagram`: the cells of `diagram`, then the prisms, polygon by polygon, the innermost first. Its `layer` says
+      which one.
+    - `thickness`: how thick each of `layers` is; see `clvoro.mesh.results.thickness_in_words`.
 
-    Warns
-    -----
-    MismatchWarning
-        Where layers are thinner: how many polygons, and the place of the thinnest.
+    Warns with `MismatchWarning` where layers are thinner: how many polygons, and the place of the thinnest.
     """
     walls = _LayeredWalls(diagram, layers)
     share = walls.first_shares()
@@ -122,17 +113,11 @@ class _Layered:
 class _LayeredWalls:
     """The walls of a mesh, as layers need them.
 
-    Attributes
-    ----------
-    faces : Faces
-        Of the mesh without layers.
-    rows : (w,) int
-        Its faces on walls.
-    patch : (w,) int
-    starts, corners : (w + 1,), (c,) int
-        Vertices around each of `rows`.
-    vertices : (u,) int
-        Vertices on walls, ascending; the arrays below have a row for each.
+    - `faces`: of the mesh without layers.
+    - `rows` (w,) int: its faces on walls.
+    - `patch`: (w,) int
+    - `starts`, `corners` (w + 1,), (c,) int: vertices around each of `rows`.
+    - `vertices` (u,) int: vertices on walls, ascending; the arrays below have a row for each.
     """
 
     def __init__(self, diagram: Diagram, layers: Sequence[Layers]) -> None:

@@ -19,13 +19,8 @@ def narrow_faces(faces: Faces, sizes: np.ndarray, among: np.ndarray) -> np.ndarr
     Where a wall is curved, the common edge of two wall polygons may bulge out of the planes of both. So does the center
     of the face between their cells if that is small.
 
-    Parameters
-    ----------
-    faces : Faces
-    sizes : (n,) float
-        h of the cells.
-    among : (n,) bool
-        The cells that are examined.
+    - `sizes` (n,) float: h of the cells.
+    - `among` (n,) bool: the cells that are examined.
     """
     chosen = np.zeros(len(faces), bool)
     chosen[faces.measures.concave_pairs(DefectLimits().concavity, among)[0]] = True

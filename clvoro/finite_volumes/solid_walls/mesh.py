@@ -70,21 +70,14 @@ _MISSED = 0.1
 class _Made:
     """Cells near the surface that end there.
 
-    Attributes
-    ----------
-    near : NearWalls
-    walls : (p + 1,) int
-        How the walls of each cell are made.
-    faces : Faces
-    home : (m,) int
-        The cell of `NearWalls` that each one was.
-    own : (m,) bool
-        Whether it holds the generator. Those that do come first, ascending; then follow further parts of cells that
-        have been cut along concave creases.
-    rejected : (k,) int
-        See `rejected_at_walls`.
-    cures : Cures or None
-        What has been done to the cells.
+    - `near`: NearWalls
+    - `walls` (p + 1,) int: how the walls of each cell are made.
+    - `faces`: Faces
+    - `home` (m,) int: the cell of `NearWalls` that each one was.
+    - `own` (m,) bool: whether it holds the generator. Those that do come first, ascending; then follow further parts of
+      cells that have been cut along concave creases.
+    - `rejected` (k,) int: see `rejected_at_walls`.
+    - `cures`: what has been done to the cells.
     """
 
     near: NearWalls
@@ -115,12 +108,8 @@ def outer_generators(surface: WallSurface, points: np.ndarray, sizes: np.ndarray
     They are farther from each point of the solid than its nearest generator is. So they do not change the diagram
     inside.
 
-    Parameters
-    ----------
-    points : (n, 3) float
-        Generators inside.
-    sizes : (n,) float
-        h at the generators.
+    - `points` (n, 3) float: generators inside.
+    - `sizes` (n,) float: h at the generators.
     """
     near, foot, distance = _close_to(surface, points, 1.5 * sizes)
     h = sizes[near]
@@ -143,13 +132,8 @@ def off_middle(surface: WallSurface, points: np.ndarray, sizes: np.ndarray) -> n
     Where all stand halfway between two walls, the normals of all faces between cells lie in one plane. OpenFOAM rejects
     such cells.
 
-    Parameters
-    ----------
-    surface : WallSurface
-    points : (n, 3) float
-        Generators inside.
-    sizes : (n,) float
-        h at the generators.
+    - `points` (n, 3) float: generators inside.
+    - `sizes` (n,) float: h at the generators.
     """
     near, foot, distance = _close_to(surface, points, _THIN * sizes)
     kept = distance < -0.05 * sizes[near]
@@ -188,35 +172,19 @@ def solid_diagram(
     Where OpenFOAM would reject cells, their generators and those beside them are moved a little, and the mesh is made
     again.
 
-    Parameters
-    ----------
-    surface : WallSurface
-    points : (n, 3) float
-        Generators inside.
-    sizes : (n,) float
-        h at the generators.
-    whole : callable
-        Returns the faces of the diagram of generators (n, 3), and of `outer_generators` after them, in a box around
-        the solid.
-    tell : callable
-        Called with the name of each part of the work.
-    warns : bool
-        Whether it warns of what is wrong with the mesh.
-    held : int
-        How many of the first generators are not moved.
-    centers : bool
-        Move generators to the centroids of their cells where these are far and faces oblique, as at sharp tips.
+    - `points` (n, 3) float: generators inside.
+    - `sizes` (n,) float: h at the generators.
+    - `whole`: returns the faces of the diagram of generators (n, 3), and of `outer_generators` after them, in a box
+      around the solid.
+    - `tell`: called with the name of each part of the work.
+    - `warns`: whether it warns of what is wrong with the mesh.
+    - `held`: how many of the first generators are not moved.
+    - `centers`: move generators to the centroids of their cells where these are far and faces oblique, as at sharp
+      tips.
 
-    Raises
-    ------
-    InputError
-        If generators have no cell, as the solid is too thin there.
-
-    Warns
-    -----
-    MismatchWarning
-        With `warns`, if generators have no cell, cells are cut, leave out creases, or are concave. It says how many,
-        and the first place.
+    Raises `InputError` if generators have no cell, as the solid is too thin there.
+    With `warns` it warns with `MismatchWarning` if generators have no cell, cells are cut, leave out creases, or are
+    concave. It says how many, and the first place.
     """
 
     def remake(state: np.ndarray, last: _Made | None) -> _Made | None:
@@ -419,11 +387,8 @@ def diagram_of(faces: Faces) -> Diagram:
 class _Maker:
     """Makes the mesh; vertices are those of the diagram, then piercings of edges, crossings of creases, and corners.
 
-    Attributes
-    ----------
-    points : (v, 3) float
-    site : (v,) int
-        See `WallSurface`; -1 for vertices inside.
+    - `points`: (v, 3) float
+    - `site` (v,) int: see `WallSurface`; -1 for vertices inside.
     """
 
     def __init__(self, surface: WallSurface, near: NearWalls, walls: np.ndarray) -> None:

@@ -39,20 +39,12 @@ class CellFaces:
 class NearWalls:
     """The cells near a surface, p of n, and the rest as cell p.
 
-    Attributes
-    ----------
-    faces : Faces
-        Of the whole diagram, with outer cells beyond n.
-    points : (n, 3) float
-        Generators.
-    rows : (p,) int
-        Cells near the surface, ascending.
-    at_wall : (p + 1,) bool
-        Cells that may reach the surface.
-    generators, sizes : (p + 1, 3), (p + 1,) float
-        Those of the rest are far away.
-    cells : CellFaces
-        Without those towards outer cells.
+    - `faces`: of the whole diagram, with outer cells beyond n.
+    - `points` (n, 3) float: generators.
+    - `rows` (p,) int: cells near the surface, ascending.
+    - `at_wall` (p + 1,) bool: cells that may reach the surface.
+    - `generators`, `sizes` (p + 1, 3), (p + 1,) float: those of the rest are far away.
+    - `cells`: without those towards outer cells.
     """
 
     faces: Faces
@@ -107,22 +99,14 @@ class NearWalls:
     def put_back(self, made: Faces, home: np.ndarray, own: np.ndarray) -> tuple[Faces, np.ndarray]:
         """Put the cells near the surface back among those of the rest.
 
-        Parameters
-        ----------
-        made : Faces
-            The cells near the surface as they have become. Faces to the rest are as they were, with the number of
-            `CellFaces.row` as their `half_face`.
-        home : (m,) int
-            The cell, here, that each of them was.
-        own : (m,) bool
-            Whether it holds the generator. Those that do come first, ascending.
+        - `made`: the cells near the surface as they have become. Faces to the rest are as they were, with the number of
+          `CellFaces.row` as their `half_face`.
+        - `home` (m,) int: the cell, here, that each of them was.
+        - `own` (m,) bool: whether it holds the generator. Those that do come first, ascending.
 
-        Returns
-        -------
-        faces : Faces
-            The mesh of the solid.
-        home : (m,) int
-            See `Diagram.home`.
+        Results:
+        - `faces`: the mesh of the solid.
+        - `home` (m,) int: see `Diagram.home`.
         """
         whole, n, p = self.faces, len(self.points), len(self.rows)
         generator = np.append(self.rows, n)[home]

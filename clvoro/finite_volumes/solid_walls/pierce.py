@@ -50,13 +50,9 @@ def pierce_edges(
 ) -> PiercedEdges:
     """Find where edges cross the surface.
 
-    Parameters
-    ----------
-    a, b : (e, 3) float
-        Ends.
-    distances : (e, 2) float
-        Signed distances of the ends from the surface; 0 for ends on it.
-    h : (e,) float
+    - `a`, `b` (e, 3) float: ends.
+    - `distances` (e, 2) float: signed distances of the ends from the surface; 0 for ends on it.
+    - `h`: (e,) float
     """
     length = np.linalg.norm(b - a, axis=1)
     samples = _sample(surface, a, b, distances, h, length)

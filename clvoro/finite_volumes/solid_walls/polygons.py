@@ -98,13 +98,8 @@ def chain_loops(
 class Divider:
     """Divides loops between patches.
 
-    Parameters
-    ----------
-    surface : WallSurface
-    corners_of : dict
-        Corners (numbers) in the interior of each cell.
-    vertex_of_corner : callable
-        Returns the vertex of a corner.
+    - `corners_of`: corners (numbers) in the interior of each cell.
+    - `vertex_of_corner`: returns the vertex of a corner.
     """
 
     def __init__(self, surface: WallSurface, corners_of: dict[int, list[int]], vertex_of_corner) -> None:

@@ -47,18 +47,11 @@ def trim_faces(
     A part of two corners is an edge with both ends outside, of a face without a corner inside. It has an area once a
     vertex on a crease follows on its chord.
 
-    Parameters
-    ----------
-    starts, corners : (f + 1,), (k,) int
-        Corners of each face, in order.
-    edges, forward : (k,) int, (k,) bool
-        Edge from each corner to the next, and whether it begins there.
-    sides : (v,) int8
-        Of each vertex: IN, WALL or OUT.
-    pierced : PiercedEdges
-    points : (v + p, 3) float
-        Of vertices and piercings.
-    h : (f,) float
+    - `starts`, `corners` (f + 1,), (k,) int: corners of each face, in order.
+    - `edges`, `forward` (k,) int, (k,) bool: edge from each corner to the next, and whether it begins there.
+    - `sides` (v,) int8: of each vertex: IN, WALL or OUT.
+    - `points` (v + p, 3) float: of vertices and piercings.
+    - `h`: (f,) float
     """
     v = len(sides)
     face = np.repeat(np.arange(len(starts) - 1), np.diff(starts))

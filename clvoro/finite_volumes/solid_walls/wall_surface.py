@@ -27,12 +27,8 @@ class WallSurface:
     A wall vertex lies on a patch, on a crease or on a corner. Its `site` says where: site k is patch k; the edges of
     creases follow, and then the corners.
 
-    Parameters
-    ----------
-    solid : Solid
-    nearest : callable, optional
-        Returns the triangle nearest to each of the points (k, 3) within a reach, (k,) or a number; -1 where there is
-        none; (k,) int. By default the solid's own search does.
+    - `nearest`: returns the triangle nearest to each of the points (k, 3) within a reach, (k,) or a number; -1 where
+      there is none; (k,) int. By default the solid's own search does.
     """
 
     def __init__(

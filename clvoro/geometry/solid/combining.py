@@ -63,10 +63,7 @@ def around(body: Solid, box: Solid) -> dict[str, Any]:
 def library() -> Any:
     """Return the module manifold3d.
 
-    Raises
-    ------
-    MissingLibraryError
-        If it is not installed.
+    Raises `MissingLibraryError` if it is not installed.
     """
     try:
         import manifold3d
@@ -81,12 +78,7 @@ def library() -> Any:
 def boolean(operation: str, *parts: NamedTriangles) -> dict[str, Any]:
     """Return the arguments of the sum (+) or common part (^) of solids, or of the first without the others (-).
 
-    Raises
-    ------
-    MissingLibraryError
-        If manifold3d is not installed.
-    InputError
-        If nothing is left.
+    Raises `MissingLibraryError` if manifold3d is not installed. Raises `InputError` if nothing is left.
     """
     manifold3d = library()
     names = list(dict.fromkeys(name for part in parts for name in part[3]))

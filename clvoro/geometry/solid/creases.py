@@ -67,12 +67,9 @@ def pair_sides(vertices: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray,
     Where four or more triangles share an edge (bodies that touch there), those pair up that bound one wedge of the
     inside.
 
-    Returns
-    -------
-    twin : (3 t,) int
-        For side s of triangle k, at 3 k + s, the other side of the pair; -1 without one.
-    bad : (b,) int
-        Sides without a partner: of holes, or of triangles that are oriented differently.
+    Results:
+    - `twin` (3 t,) int: for side s of triangle k, at 3 k + s, the other side of the pair; -1 without one.
+    - `bad` (b,) int: sides without a partner: of holes, or of triangles that are oriented differently.
     """
     ends = np.stack([triangles, np.roll(triangles, -1, axis=1)], axis=2).reshape(-1, 2)
     low, high = ends.min(axis=1), ends.max(axis=1)
@@ -159,12 +156,10 @@ def find_creases(
 ) -> tuple[np.ndarray, Creases, np.ndarray]:
     """Divide a surface into patches at the sides where `border` (3 t,) is true.
 
-    Returns
-    -------
-    patch : (t,) int32
-    creases : Creases
-    corners : (c,) int
-        Vertices where chains meet, end or turn sharply, ascending.
+    Results:
+    - `patch`: (t,) int32
+    - `creases`: Creases
+    - `corners` (c,) int: vertices where chains meet, end or turn sharply, ascending.
     """
     side = np.arange(len(twin))
     joined = side[~border & (twin > side)]

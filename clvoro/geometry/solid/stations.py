@@ -209,23 +209,15 @@ def _placed(solid: Solid, chains: Sequence[_Crease]) -> AroundCreases:
 class ChainOfChords:
     """A chain that is divided into chords, with generators around each.
 
-    Attributes
-    ----------
-    number : int
-    vertices : (2,) int
-        Those at its ends.
-    h, middle : (n,) float
-        Of each chord: size of the cells, and length along the chain up to its middle.
-    lengths, ways : (n,) and (n, 3) float
-        Of each chord: length, and unit vector.
-    spots : (n, 3) float
-        The places on the chain at `middle`.
-    nodes, radii : (n + 1, 3) and (n + 1,) float
-        The ends of the chords, and the distances of the generators from them.
-    turns : list of (k,) float
-        The angles of the generators around each chord.
-    axes : (n, 2, 3) float
-        Unit vectors across each chord, in the directions of the angles 0 and 90 degrees.
+    - `number`: int
+    - `vertices` (2,) int: those at its ends.
+    - `h`, `middle` (n,) float: of each chord: size of the cells, and length along the chain up to its middle.
+    - `lengths`, `ways` (n,) and (n, 3) float: of each chord: length, and unit vector.
+    - `spots` (n, 3) float: the places on the chain at `middle`.
+    - `nodes`, `radii` (n + 1, 3) and (n + 1,) float: the ends of the chords, and the distances of the generators from
+      them.
+    - `turns` list of (k,) float: the angles of the generators around each chord.
+    - `axes` (n, 2, 3) float: unit vectors across each chord, in the directions of the angles 0 and 90 degrees.
     """
 
     turns: list[np.ndarray]
@@ -283,23 +275,14 @@ def _reach(half: Any) -> Any:
 class _Crease(ChainOfChords):
     """A concave crease: generators in the middle of equal sectors of its interior angle.
 
-    Attributes
-    ----------
-    angle : (n,) float
-        The interior angle at each chord, in radians.
-    full : (n,) float
-        The size of the cells around each chord where there is room.
-    scale : (n,) float
-        Their size over the full one. Below `_LEAST` it stays.
-    sectors : (n,) int
-        The number of generators around each chord.
-    span : (n,) float
-        The angle that they divide.
-    facet : (n,) float
-        The width of a facet beyond whose middle the last sector is; NaN elsewhere.
-    shared, turned : (n,) bool
-        Whether it is less than `angle`, since there is another crease on a narrow facet; and whether it ends, not
-        begins, at the left wall.
+    - `angle` (n,) float: the interior angle at each chord, in radians.
+    - `full` (n,) float: the size of the cells around each chord where there is room.
+    - `scale` (n,) float: their size over the full one. Below `_LEAST` it stays.
+    - `sectors` (n,) int: the number of generators around each chord.
+    - `span` (n,) float: the angle that they divide.
+    - `facet` (n,) float: the width of a facet beyond whose middle the last sector is; NaN elsewhere.
+    - `shared`, `turned` (n,) bool: whether it is less than `angle`, since there is another crease on a narrow facet;
+      and whether it ends, not begins, at the left wall.
     """
 
     def __init__(self, solid: Solid, number: int, size: Callable[[np.ndarray], np.ndarray]) -> None:

@@ -25,22 +25,15 @@ _MOST = 1 << 20
 def uncovered(solid: Solid, walls: np.ndarray, sizes: np.ndarray, smallest: float) -> tuple[np.ndarray, np.ndarray]:
     """Return parts between the surface of `solid` and the walls of a mesh of it; see `Domain.uncovered`.
 
-    Parameters
-    ----------
-    walls : (t, 3, 3) float
-        Corners of the triangles of the mesh's walls, counter-clockwise from outside. They bound the cells without gaps.
-    sizes : (t,) float
-        Sizes h of the cells there.
-    smallest : float
-        Volume over h^3 of the smallest parts, but for whole bodies and cavities.
+    - `walls` (t, 3, 3) float: corners of the triangles of the mesh's walls, counter-clockwise from outside. They bound
+      the cells without gaps.
+    - `sizes` (t,) float: sizes h of the cells there.
+    - `smallest`: volume over h^3 of the smallest parts, but for whole bodies and cavities.
 
-    Returns
-    -------
-    measures : (k,) float
-        Volumes: positive for parts of the solid, negative for parts of its outside. Whole bodies and cavities are
-        exact, others are counted to about 0.01 h^3.
-    places : (k, 3) float
-        A point in each.
+    Results:
+    - `measures` (k,) float: volumes: positive for parts of the solid, negative for parts of its outside. Whole bodies
+      and cavities are exact, others are counted to about 0.01 h^3.
+    - `places` (k, 3) float: a point in each.
     """
     mesh = NearestTriangles(
         Surface(walls.reshape(-1, 3), np.arange(3 * len(walls)).reshape(-1, 3)), np.arange(len(walls))

@@ -43,26 +43,16 @@ class Halo:
 
     Arrays over blocks run over axes, ends (lower, upper) and positions along the boundary, in this order.
 
-    Attributes
-    ----------
-    required : (blocks,) float32, device
-        Depth that the balls around the vertices of the latest diagram reach, with some room.
-    cells : int
-        Generators of that diagram; 0 before the first one.
-    estimated : bool
-        Whether `required` is an estimate, as before the first diagram.
-    is_bound : bool
-        Whether `required` may be far too much, so that the next diagram keeps none of it.
-    depths : (blocks,) float32, device
-        Depth within which the images of that diagram were taken.
-    requests : (blocks,) int32, device
-        Depths that the cells of a diagram require, while it is made: bits of floats.
-    extremes : (10,) int32, device
-        Largest and least of `depths`; see tessellation/periodic/halo.h.
-    kept : float32
-        Least share of its depth that the halo keeps.
-    most : (1,) int32, device
-        Key of the largest weight, in a power diagram; see geometry/weights.h.
+    - `required` (blocks,) float32, device: depth that the balls around the vertices of the latest diagram reach, with
+      some room.
+    - `cells`: generators of that diagram; 0 before the first one.
+    - `estimated`: whether `required` is an estimate, as before the first diagram.
+    - `is_bound`: whether `required` may be far too much, so that the next diagram keeps none of it.
+    - `depths` (blocks,) float32, device: depth within which the images of that diagram were taken.
+    - `requests` (blocks,) int32, device: depths that the cells of a diagram require, while it is made: bits of floats.
+    - `extremes` (10,) int32, device: largest and least of `depths`; see tessellation/periodic/halo.h.
+    - `kept`: least share of its depth that the halo keeps.
+    - `most` (1,) int32, device: key of the largest weight, in a power diagram; see geometry/weights.h.
     """
 
     def __init__(self, engine: Engine) -> None:
