@@ -36,7 +36,6 @@ Pictures show each mesh cut open, with the patches or the regions in colors.
 from __future__ import annotations
 
 import argparse
-import gzip
 import math
 import multiprocessing
 import resource
@@ -145,13 +144,9 @@ def part_of(job: int | tuple[Path, bool], cells: int) -> tuple[clvoro.Solid, flo
         h = (solid.measure / cells) ** (1 / 3)
         return solid, h, h
     path, outside = job
-    with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
+    with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        if path.suffix == ".gz":
-            copy = Path(folder) / path.stem
-            copy.write_bytes(gzip.decompress(path.read_bytes()))
-            path = copy
-        solid = clvoro.Solid.read(path, repair=True, name=job[0].name)
+        solid = clvoro.Solid.read(path, repair=True, name=path.name)
     if not outside:
         h = (solid.measure / cells) ** (1 / 3)
         return solid, h, h

@@ -183,11 +183,15 @@ class Surface:
         edges, first, count = np.unique(np.sort(ends, axis=1), axis=0, return_index=True, return_counts=True)
         return edges, count, 3 * np.flatnonzero(whole)[first // 3] + first % 3
 
+    @property
+    def open_sides(self) -> np.ndarray:
+        """Sides of triangles at edges of a single one, 3 t + s, (k,) int."""
+        return self._edges[2][self._edges[1] == 1]
+
     @cached_property
     def open_edges(self) -> np.ndarray:
         """Edges of a single triangle, (k, 2) int, as indices of vertices."""
-        _, count, where = self._edges
-        triangle, side = np.divmod(where[count == 1], 3)
+        triangle, side = np.divmod(self.open_sides, 3)
         return np.column_stack([self.triangles[triangle, side], self.triangles[triangle, (side + 1) % 3]])
 
     @property

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import gzip
 import os
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from os import PathLike
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,6 +15,7 @@ import numpy as np
 from ..errors import InputError, MissingLibraryError
 from ..files import open_plain, unlogged
 
+FilePath = str | PathLike[str]
 SURFACES = ("stl", "obj", "ply", "off")
 SOLIDS = (*SURFACES, "3mf", "step", "stp")
 _OPTIONS: dict[str, dict[str, Any]] = {
@@ -32,13 +34,25 @@ class FilePart(NamedTuple):
     triangles: np.ndarray
 
 
-def read_parts(path: str | PathLike[str], kinds: Iterable[str] = SURFACES) -> list[FilePart]:
+def read_parts(path: FilePath | Sequence[FilePath], kinds: Iterable[str] = SURFACES) -> list[FilePart]:
     """Return the parts of a surface file: solids of an STL file, groups of an OBJ file, objects of a 3MF file.
 
-    Raises `InputError` if trimesh is not installed, the file cannot be read, or it holds no triangles.
+    Parts of several files have the name of their file, before that of the part if a file has more than one. Raises
+    `InputError` if trimesh is not installed, a file cannot be read, or it holds no triangles.
     """
+    if isinstance(path, Sequence) and not isinstance(path, str):
+        files = [(Path(file), read_parts(file, kinds)) for file in path]
+        if not files:
+            raise InputError("surface files are [], expected at least one")
+        stems = [(file.with_suffix("") if file.suffix.lower() == ".gz" else file).stem for file, _ in files]
+        return [
+            part._replace(name=f"{stem}_{part.name}" if len(parts) > 1 else stem)
+            for stem, (_, parts) in zip(stems, files, strict=True)
+            for part in parts
+        ]
     path = Path(path)
-    kind = path.suffix.lower().lstrip(".")
+    packed = path.suffix.lower() == ".gz"
+    kind = (path.with_suffix("") if packed else path).suffix.lower().lstrip(".")
     if kind not in kinds:
         raise InputError(
             f"{str(path)!r} ends in {path.suffix!r}, expected a surface file: " + ", ".join(f".{f}" for f in kinds)
@@ -57,7 +71,8 @@ def read_parts(path: str | PathLike[str], kinds: Iterable[str] = SURFACES) -> li
     try:
         # Coordinates that are not finite are refused by `Surface`.
         with open_plain(path) as file, np.errstate(all="ignore"), unlogged("trimesh"):
-            loaded: Any = trimesh.load(file, file_type=kind, process=False, **_OPTIONS.get(kind, {}))
+            plain = gzip.GzipFile(fileobj=file) if packed else file
+            loaded: Any = trimesh.load(plain, file_type=kind, process=False, **_OPTIONS.get(kind, {}))
             parts = parts_of(loaded)
     except MemoryError:
         raise

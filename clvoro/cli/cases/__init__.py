@@ -167,8 +167,8 @@ class Case:
         return path
 
 
-def _files(node: Any) -> Iterator[tuple[dict[str, Any], str]]:
-    """Iterate over the tables of a case that name files, and the keys with the names."""
+def _files(node: Any) -> Iterator[tuple[Any, Any]]:
+    """Iterate over the tables and lists of a case that name files, and the keys with the names."""
     for item in node.values() if isinstance(node, dict) else node:
         if isinstance(item, (dict, list)):
             yield from _files(item)
@@ -178,6 +178,8 @@ def _files(node: Any) -> Iterator[tuple[dict[str, Any], str]]:
             for key in ("file", "points", "fixed", "land", "lines", "surfaces")
             if isinstance(node.get(key), str)
         )
+        several = node.get("file")
+        yield from ((several, k) for k in range(len(several) if isinstance(several, list) else 0))
 
 
 def _check_walls(table: dict[str, Any], domain: Domain, place: str) -> None:

@@ -602,9 +602,9 @@ class Around(Table):
 
 
 class SolidTable(Kind, tag="solid"):
-    """The inside of a surface from a file, or with `outside` the region of a box around it."""
+    """The inside of a surface from one file or several, or with `outside` the region of a box around it."""
 
-    file: Text
+    file: Text | Annotated[list[Text], Meta(min_length=1)]
     units: Text | Positive | None = None
     outside: Around | None = None
     names: Names | None = None
@@ -616,7 +616,8 @@ class SolidTable(Kind, tag="solid"):
 
     def build(self, folder: Path, domain: Any = None) -> Solid:
         options = self.given("file", "units", "outside", "names", "surfaces")
-        path = locate(folder, self.file)
+        one = isinstance(self.file, str)
+        path = locate(folder, self.file) if one else [locate(folder, file) for file in self.file]
         if self.outside is None:
             made = Solid.read(path, self.units, names=self.names, **options)
         else:

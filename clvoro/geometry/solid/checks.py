@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import scipy
@@ -19,6 +20,7 @@ _FLAT = 1e-3  # of the extent of a hole: how far it may deviate from a plane
 _APART = 1e-6  # of the diagonal: how far from a triangle its two sides are examined
 _LARGEST_GAP = 1e-3  # of the diagonal: gaps that `join` may close
 _SHARPEST = 10.0  # degrees
+_NAMED = 3  # pairs of parts with open edges that a message names
 _OR_WRAP = "Or pass wrap=, two thirds of the size of cells, for a closed surface around all triangles"
 
 
@@ -49,7 +51,35 @@ def repeated_triangles(triangles: np.ndarray) -> np.ndarray:
     return np.setdiff1d(np.arange(len(triangles)), first)
 
 
-def require_bounding(surface: Surface, vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+def _gaps(surface: Surface, parts: Sequence[str]) -> str:
+    """Return which parts have open edges, and how far those of the nearest other part are from them at most.
+
+    Parameters
+    ----------
+    parts : (t,) str
+        The part of each triangle.
+    """
+    names, part = np.unique(np.array(parts)[surface.open_sides // 3], return_inverse=True)
+    if len(names) < 2:
+        return f" All are of {names[0]}." if len(names) and len(set(parts)) > 1 else ""
+    middles = surface.vertices[surface.open_edges].mean(axis=1)
+    away = np.full((len(names), len(part)), math.inf)
+    for k in range(len(names)):
+        away[k, part != k] = scipy.spatial.KDTree(middles[part == k]).query(middles[part != k])[0]
+    pair = np.sort(np.column_stack([part, away.argmin(axis=0)]), axis=1)
+    pairs, count = np.unique(pair, axis=0, return_counts=True)
+    found = []
+    for k in np.argsort(-count, kind="stable")[:_NAMED]:
+        mine = np.flatnonzero((pair == pairs[k]).all(axis=1))
+        at = mine[away.min(axis=0)[mine].argmax()]
+        apart, where = away[:, at].min(), format_point(middles[at])
+        found.append(f"{count[k]} are between {' and '.join(names[pairs[k]])}, up to {apart:.3g} apart, at {where}")
+    return f" Of these {'; '.join(found)}."
+
+
+def require_bounding(
+    surface: Surface, vertices: np.ndarray, triangles: np.ndarray, parts: Sequence[str] = ()
+) -> np.ndarray:
     """Raise unless the triangles (t, 3) bound a region with normals outwards; return the partners of their sides.
 
     Parameters
@@ -58,6 +88,8 @@ def require_bounding(surface: Surface, vertices: np.ndarray, triangles: np.ndarr
         As given, for messages.
     vertices, triangles : arrays
         The welded surface.
+    parts : (t,) str
+        The name of the part that each triangle of `surface` belongs to, for messages.
 
     Raises
     ------
@@ -78,7 +110,7 @@ def require_bounding(surface: Surface, vertices: np.ndarray, triangles: np.ndarr
             surface.require_closed()
         except InputError as error:
             remedy = _OR_WRAP if join is None else f"Here join={join:g} closes it"
-            raise InputError(f"{error}. {remedy}") from None
+            raise InputError(f"{error}.{_gaps(surface, parts)} {remedy}") from None
     twin, bad = pair_sides(vertices, triangles)
     if bad.size:
         k, s = divmod(int(bad[0]), 3)

@@ -26,7 +26,7 @@ from ..domain import Domain
 from ..polygon import Polygon
 from ..shapes import Edges
 from ..surface import Surface
-from ..surface_files import SOLIDS, FilePart, joined, parts_of, read_parts, word
+from ..surface_files import SOLIDS, FilePart, FilePath, joined, parts_of, read_parts, word
 from ..triangles import packed_weights, pierced
 from ..wall_triangles import WallTriangles
 from .checks import repaired, require_bounding, sharp_edges, volume_inside
@@ -227,7 +227,7 @@ class Solid(Domain):
         whole = (merged != np.roll(merged, -1, axis=1)).all(axis=1)
         self._group, merged = group[whole], merged[whole]
         self.surface = Surface(places, merged, name)
-        self.twin = require_bounding(given, places, merged)
+        self.twin = require_bounding(given, places, merged, [self._group_names[g] for g in group.tolist()])
         angle = 30 if angle is None else angle
         if not (isinstance(angle, Real) and 0 < angle < 180):
             raise InputError(f"{name} angle is {angle!r}, expected degrees between 0 and 180")
@@ -280,15 +280,16 @@ class Solid(Domain):
         return np.isin(ends @ (n, 1), edges @ (n, 1))
 
     @classmethod
-    def read(cls, path: str | PathLike[str], units: str | float | None = None, **options: Any) -> Solid:
-        """Read a solid from an STL, OBJ, PLY, OFF or 3MF file with trimesh, or from a STEP file with Gmsh.
+    def read(cls, path: FilePath | Sequence[FilePath], units: str | float | None = None, **options: Any) -> Solid:
+        """Read a solid from STL, OBJ, PLY, OFF or 3MF files with trimesh, or from a STEP file with Gmsh.
 
         Solids of an STL file, groups of an OBJ file, objects of a 3MF file and named faces of a STEP file give
-        boundaries their names.
+        boundaries their names. Several files are parts of one surface, which have the names of their files.
 
         Parameters
         ----------
-        path : str or path
+        path : str, path, or a sequence of them
+            Files may be packed by gzip: ``part.stl.gz``.
         units : str or float, optional
             The unit of the numbers in the file: m, mm, cm, km, um, in, ft, or its length in meters. The solid is in
             meters then; by default numbers stay as they are. STEP files say their unit: the solid is in meters.
@@ -303,7 +304,10 @@ class Solid(Domain):
             If the file needs a library that is not installed.
         """
         unit = unit_length(units)
-        return cls(**{**_from_parts(read_parts(path, SOLIDS), unit), "name": f"solid {str(path)!r}", **options})
+        arguments = _from_parts(read_parts(path, SOLIDS), unit)
+        first, *others = [path] if isinstance(path, str | PathLike) else path
+        name = f"solid {str(first)!r}" + (f" with {len(others)} more files" if others else "")
+        return cls(**{**arguments, "name": name, **options})
 
     @classmethod
     def from_trimesh(cls, mesh: Any, **options: Any) -> Solid:
