@@ -209,8 +209,8 @@ def _add_convert(commands: Any) -> None:
     convert = commands.add_parser(
         "convert",
         help="write a mesh in another format",
-        description="Read a mesh that clvoro wrote and write it in the format that the suffix of OUT names: "
-        ".vtu, .npz, .foam (or a folder polyMesh), .nc, .info (METIS), .info.part.N (its parts), .vtk, .ply, .obj.",
+        description="Read a mesh that clvoro wrote and write it in the format that the suffix of OUT names: .vtu, "
+        ".npz, .foam (or a folder polyMesh), .cgns, .nc, .info (METIS), .info.part.N (its parts), .vtk, .ply, .obj.",
     )
     convert.set_defaults(work=_convert)
     convert.add_argument("mesh", metavar="MESH", help="mesh.npz, mesh.vtu, mesh.pvtu, or mesh.nc on a sphere")

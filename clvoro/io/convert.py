@@ -182,7 +182,8 @@ def _known(values: np.ndarray) -> np.ndarray:
 _POLYGONS = {".vtk": True, ".ply": False, ".obj": False}
 
 _SAFE = (
-    ".npz (everything), .vtu (ParaView), .foam (OpenFOAM), .nc (QGIS, UGRID, MPAS), .info (METIS), .vtk, .ply or .obj"
+    ".npz (everything), .vtu (ParaView), .foam (OpenFOAM), .cgns, .nc (QGIS, UGRID, MPAS), .info (METIS), .vtk, .ply "
+    "or .obj"
 )
 
 _PICTURE = "it is no mesh file; write mesh.plot().savefig(path)"
