@@ -76,8 +76,7 @@ class Density:
             engine.run_each(
                 k.fit_gradient,
                 t.n,
-                t.starts,
-                t.neighbors,
+                *t.graph,
                 t.points,
                 log_h,
                 t.offsets,

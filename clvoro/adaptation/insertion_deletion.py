@@ -179,7 +179,7 @@ class InsertionDeletion:
         self._labels, self._fixed = generators.labels, fixed
         keys = self._keys(t)
         deficit = engine.real.type(deficit)
-        engine.run_each(k.score_bad_cells, n, t.starts, t.neighbors, quality, deficit, *t.name_args, keys)
+        engine.run_each(k.score_bad_cells, n, *t.graph, quality, deficit, *t.name_args, keys)
         self._drop_fixed(t, keys, neighbors=True)
         chosen = self._choose(t, keys, PAIR_RINGS)
         self._limit(t, chosen, most)
@@ -226,7 +226,7 @@ class InsertionDeletion:
 
     def _measure(self, t: Tessellation, h: cla.Array) -> tuple[cla.Array, cla.Array, cla.Array]:
         """Return charge and number of walls (n, 2), and the strain averaged over one and over two rings (n, 4)."""
-        engine, k, n, graph = self.engine, self._kernels, t.n, (t.starts, t.neighbors, t.points)
+        engine, k, n, graph = self.engine, self._kernels, t.n, (*t.graph, t.points)
         kinds = self._room("kinds", size=2 * t.rows, dtype=np.int32).reshape(-1, 2)
         raw, once = (self._room("strain", turn, size=4 * t.rows, dtype=np.float32).reshape(-1, 4) for turn in range(2))
         with engine.workspace.frame():
@@ -250,7 +250,7 @@ class InsertionDeletion:
         """Mark at most `nuclei` insertions and as many mergers where the perfect lattice is strained most."""
         engine, k, n = self.engine, self._kernels, t.n
         keys, names, limit = self._keys(t), t.name_args, engine.real.type(NUCLEATION_STRAIN)
-        engine.run_each(k.score_strain, n, t.starts, t.neighbors, kinds, strain, limit, *names, keys)
+        engine.run_each(k.score_strain, n, *t.graph, kinds, strain, limit, *names, keys)
         self._drop_fixed(t, keys, neighbors=True)
         chosen = self._choose(t, keys, NUCLEUS_RINGS)
         self._limit(t, chosen, 2 * nuclei)
@@ -266,8 +266,7 @@ class InsertionDeletion:
             chosen,
             ranks,
             np.int32(first),
-            t.starts,
-            t.neighbors,
+            *t.graph,
             t.points,
             *names,
             marks.shifts,
@@ -278,7 +277,7 @@ class InsertionDeletion:
             *engine.period_args,
         )
         t.forward(engine, merged)
-        engine.run_each(k.delete_merged, n, t.starts, t.neighbors, merged, *names, marks.kept)
+        engine.run_each(k.delete_merged, n, *t.graph, merged, *names, marks.kept)
 
     def _climb(
         self,
@@ -302,8 +301,7 @@ class InsertionDeletion:
         engine.run_each(
             k.score_pairs,
             n,
-            t.starts,
-            t.neighbors,
+            *t.graph,
             t.points,
             kinds,
             strain,
@@ -329,8 +327,7 @@ class InsertionDeletion:
         engine.run_each(
             k.mark_pairs,
             n,
-            t.starts,
-            t.neighbors,
+            *t.graph,
             chosen,
             pull,
             kinds,
@@ -350,7 +347,7 @@ class InsertionDeletion:
         """Mark about `rest` of the largest cells to split, or -rest of the smallest to delete, relative to h."""
         engine, k, n = self.engine, self._kernels, t.n
         sign, keys = engine.real.type(math.copysign(1, rest)), self._keys(t)
-        engine.run_each(k.score_log_ratio, n, t.starts, t.neighbors, log_ratio, sign, *t.name_args, keys)
+        engine.run_each(k.score_log_ratio, n, *t.graph, log_ratio, sign, *t.name_args, keys)
         self._drop_fixed(t, keys, neighbors=False)
         engine.run_each(k.drop_sites, n, self.spread(t, marks.busy, LOG_RATIO_RINGS), keys)
         chosen = self._choose(t, keys, LOG_RATIO_RINGS)
@@ -365,7 +362,7 @@ class InsertionDeletion:
             with self.engine.workspace.frame():
                 labels = t.fixed_args(self.engine, self._labels, self._fixed)
                 drop = self._kernels.drop_fixed_sites
-                self.engine.run_each(drop, t.n, t.starts, t.neighbors, *labels, np.int32(neighbors), keys)
+                self.engine.run_each(drop, t.n, *t.graph, *labels, np.int32(neighbors), keys)
 
     def spread(self, t: Tessellation, source: cla.Array, rings: int) -> cla.Array:
         """Return the largest key within `rings` rings of each generator. The rows of ghosts in `source` are filled."""
@@ -374,7 +371,7 @@ class InsertionDeletion:
         groups, at_once = (1, rings) if n <= self._one_group_limit and t.part is None else (engine.groups, 1)
         for _ in range(rings // at_once):
             t.forward(engine, source)
-            graph = t.starts, t.neighbors
+            graph = t.graph
             engine.run_groups(self._kernels.spread_keys, groups, n, at_once, *graph, source, into, other)
             source, into, other = into, other, into
         return source if at_once % 2 else into
@@ -458,8 +455,7 @@ class InsertionDeletion:
             new.velocity,
             new.signatures,
             new.ever_changed,
-            t.starts,
-            t.neighbors,
+            *t.graph,
             t.face_centroids,
             *t.outlines,
         )

@@ -82,7 +82,7 @@ class LocalCounts:
             array.fill(0)
         missing, total = mesh.missing_cells(w), 0
         pieces = PieceCounts(mesh, w) if mesh.domain.n_pieces > 1 else None
-        graph = t.starts, t.neighbors, t.face_measures, t.points
+        graph = *t.graph, t.face_measures, t.points
         laplacian = poisson.assemble(*graph, tolerance=BALANCE_TOLERANCE, part=t.part)
         for turn in count():
             offset = real(offset_of(missing, math.inf) if pieces is None else 0)
@@ -92,8 +92,7 @@ class LocalCounts:
                 engine.run_each(
                     k.score_potential,
                     n,
-                    t.starts,
-                    t.neighbors,
+                    *t.graph,
                     w.log_ratio,
                     potential,
                     offset,

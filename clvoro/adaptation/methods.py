@@ -70,9 +70,7 @@ class PublishedMethod(Method):
         poisson.subtract_mean_source(mesh.error, t.volumes, source)
         balance_components(mesh.engine, mesh.domain, t, source, t.volumes)
         with engine.workspace.frame():
-            laplacian = poisson.assemble(
-                t.starts, t.neighbors, t.face_measures, t.points, tolerance=r.tolerance, part=t.part
-            )
+            laplacian = poisson.assemble(*t.graph, t.face_measures, t.points, tolerance=r.tolerance, part=t.part)
             solution = poisson.solve(laplacian, source, mesh.potential, tolerance=r.tolerance, ordering=mesh.labels)
         motion.compute_potential_gradient(t, mesh.potential, correction)
         mesh.summarize_displacements(lloyd, correction)
@@ -118,8 +116,7 @@ class WeightedMethod(Method):
         balance_components(mesh.engine, mesh.domain, t, source, w.weight)
         with engine.workspace.frame():
             laplacian = poisson.assemble(
-                t.starts,
-                t.neighbors,
+                *t.graph,
                 t.face_measures,
                 t.points,
                 *t.with_ghosts(engine, w.density),

@@ -91,8 +91,7 @@ class Motion:
             self.engine.run_each(
                 self._kernels.compute_potential_gradient,
                 t.n,
-                t.starts,
-                t.neighbors,
+                *t.graph,
                 t.face_measures,
                 t.face_centroids,
                 t.volumes,
@@ -134,8 +133,7 @@ class Motion:
         self.engine.run_each(
             self._kernels.leave_balls,
             t.n,
-            t.starts,
-            t.neighbors,
+            *t.graph,
             *t.fixed_args(self.engine, moving.labels, moving.fixed),
             np.int32(balls.first),
             np.int32(balls.count),

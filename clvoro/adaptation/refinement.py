@@ -43,8 +43,7 @@ class Refinement:
         engine.run_each(
             k.place_new_generators,
             n,
-            t.starts,
-            t.neighbors,
+            *t.graph,
             t.face_measures,
             t.volumes,
             t.points,
@@ -78,14 +77,7 @@ class Refinement:
         """Return the prefix sums (n + 1,) int32 of the numbers of new generators."""
         starts = self.engine.empty(t.n + 1, np.int32)
         self.engine.run_each(
-            self._kernels.count_new_generators,
-            t.n,
-            t.starts,
-            t.neighbors,
-            t.face_measures,
-            t.volumes,
-            *fixed_args,
-            starts,
+            self._kernels.count_new_generators, t.n, *t.graph, t.face_measures, t.volumes, *fixed_args, starts
         )
         self._scan.exclusive(starts, starts, t.n)
         return starts

@@ -52,11 +52,9 @@ class ThinWalls:
             partners, targets = engine.scratch(u, np.int32), engine.scratch((2 * u, 2))
             points, h = t.with_ghosts(engine, moving.points, h)
             labels = t.fixed_args(engine, moving.labels, moving.fixed)
-            graph = convex.starts, convex.neighbors
+            graph = convex.graph
             args = points, h, *labels, *free.device_args(engine)
-            engine.run_each(
-                k.find_partners, u, chords.touched, n, *graph, whole.starts, whole.neighbors, *args, partners
-            )
+            engine.run_each(k.find_partners, u, chords.touched, n, *graph, *whole.graph, *args, partners)
             engine.run_each(k.place_pairs, u, chords.touched, n, chords.slots, partners, *graph, *args, targets)
             given = chords.slots, partners, targets, moving.points, moving.velocity
             engine.run_each(k.move_pairs, u, chords.touched, np.int32(t.n), *given)

@@ -186,7 +186,7 @@ class Transport:
         with engine.workspace.frame():
             measures = power.laplacian_measures(t)
             finest = FINEST[engine.real.name] if t.n <= FEW else tolerance
-            laplacian = self._poisson.assemble(t.starts, t.neighbors, measures, points, tolerance=finest)
+            laplacian = self._poisson.assemble(*t.graph, measures, points, tolerance=finest)
             solution = self._poisson.solve(
                 laplacian, now.rhs, step, tolerance=tolerance, ordering=ordering, from_zero=True
             )

@@ -164,7 +164,7 @@ class VolumeProjection:
         store = np.dtype(np.float32) if single else engine.real
         v, k = self._reserve(n, t.rows, m, store, most), self._kernels_in(store)
         start = engine.scratch(n, np.float32) if start is None else start
-        iteration = (n, most, m, int(warm), real(limits.tolerance), t.starts, t.neighbors, *v, self._partial)
+        iteration = (n, most, m, int(warm), real(limits.tolerance), *t.graph, *v, self._partial)
         assembly = self._assembly(t, targets, displacement, penalty, labels, fixed)
         given, rest = (*iteration, self._record), (*assembly, start, *engine.period_args)
         if n <= self._one_group_limit and t.part is None:

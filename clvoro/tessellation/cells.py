@@ -117,8 +117,7 @@ class Cells(CellBuilder):
             binned.items,
             binned.reach,
             part.points,
-            t.starts,
-            t.neighbors,
+            *t.graph,
             *part.box.device_corners(engine.real),
             *part.halo_args,
         )
@@ -187,8 +186,7 @@ class Cells(CellBuilder):
             n,
             points,
             *rows.corners,
-            previous.starts,
-            previous.neighbors,
+            *previous.graph,
             rows.slots,
             rows.counts,
             rows.places,
@@ -204,14 +202,7 @@ class Cells(CellBuilder):
         engine, m = self.engine, len(t.neighbors)
         measures, centroids = engine.empty(m), engine.empty((m, engine.dim))
         engine.run_each(
-            self._kernels.measure_faces,
-            t.n,
-            t.starts,
-            t.neighbors,
-            t.sites,
-            *box.device_corners(engine.real),
-            measures,
-            centroids,
+            self._kernels.measure_faces, t.n, *t.graph, t.sites, *box.device_corners(engine.real), measures, centroids
         )
         return replace(t, face_measures=measures, face_centroids=centroids)
 
@@ -358,7 +349,7 @@ class Cells(CellBuilder):
             self._reset_report(first, slots, whole)
         faces, counts = engine.scratch(slots * SLOT, np.int32), engine.scratch(slots, np.int32)
         keep, places = engine.scratch(slots, np.uint32), engine.scratch(n, np.int32)
-        old = (places, places) if previous is None else (previous.starts, previous.neighbors)
+        old = (places, places) if previous is None else previous.graph
         share = engine.real.type(EXACT_SHARE if exact else ROUGH_SHARE)
         starts, corners = engine.scratch(n + 1, np.int32), box.device_corners(engine.real)
         return FaceRows(faces, counts, keep, places, starts, self._report, old, points, corners, share)

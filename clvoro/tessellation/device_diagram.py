@@ -153,6 +153,11 @@ class Tessellation:
             object.__setattr__(self, "sites", self.points)
 
     @property
+    def graph(self) -> tuple[cla.Array, cla.Array]:
+        """Starts and neighbors, as arguments of kernels."""
+        return self.starts, self.neighbors
+
+    @property
     def rows(self) -> int:
         """Number of rows of arrays of values that neighbors name: generators, and ghosts if there are any."""
         return self.n if self.part is None else self.part.count
@@ -221,6 +226,11 @@ class NeighborRows:
     """(n + 1,) int32."""
     neighbors: cla.Array
     """(m,) int32."""
+
+    @property
+    def graph(self) -> tuple[cla.Array, cla.Array]:
+        """Starts and neighbors, as arguments of kernels."""
+        return self.starts, self.neighbors
 
     @classmethod
     def copy_of(cls, t: Tessellation) -> NeighborRows:

@@ -165,7 +165,7 @@ class Part:
 
         `defines` are those of the builder of its cells. `enqueue` stands for `Engine.run_each`.
         """
-        given = (t.starts, t.neighbors, self.labels, t.sites, *self.box.clip_args(engine), *t.vertices[:1])
+        given = (*t.graph, self.labels, t.sites, *self.box.clip_args(engine), *t.vertices[:1])
         reach = engine.scratch(t.n, np.float32) if t.reach is None else t.reach
         measures = t.face_measures, t.face_centroids, t.volumes, t.offsets, t.covariances, reach
         order = engine.kernels("tessellation/row_order", {**defines, "BY_PLACE": 1}, shared=True).order_rows
@@ -210,11 +210,11 @@ class Part:
         farther. The signed sums of all parts add up to zero if each face between two parts has both sides.
         """
         sums = engine.scratch((SUMS, 5))
-        given = t.starts, t.neighbors, self.labels, t.face_measures, t.volumes
+        given = *t.graph, self.labels, t.face_measures, t.volumes
         limited = np.int32(with_ghosts), engine.real.type(factor), t.reach, self.points, at, limits, needed, periods
         kernel = engine.kernels("tessellation/part", shared=True).sum_cells
         convex = t if t.trimmed is None else t.trimmed.convex
-        rows = np.int32(self.n_own), np.int32(self.count), convex.starts, convex.neighbors
+        rows = np.int32(self.n_own), np.int32(self.count), *convex.graph
         engine.run_each(kernel, SUMS, *rows, *given, *limited, sums)
         return sums.get().sum(axis=0, dtype=float)
 

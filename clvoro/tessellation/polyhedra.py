@@ -171,7 +171,7 @@ class Polyhedra(CellBuilder):
         places, counts = engine.scratch(rows, np.int32), engine.scratch(rows, np.int32)
         cells = self.cells_of(rows)
         warm = previous is not None and previous.n == rows
-        old = (previous.starts, previous.neighbors) if previous is not None and warm else (counts, counts)
+        old = previous.graph if previous is not None and warm else (counts, counts)
         capacity, again = FACE_CAPACITY, False
         in_lanes = self._walks is not None and rows >= LANES_FROM[3]
         corners = engine.scratch(2 * self._room, np.uint32) if keep else None
@@ -283,7 +283,7 @@ class Polyhedra(CellBuilder):
         self, cut: CutCells, report: cla.Array, part: Part, binned: BinnedPoints, previous: Tessellation | NeighborRows
     ) -> None:
         """Clip the unfinished cells of `cut` by all generators and ghosts of `part` near them."""
-        start, share = (True, previous.starts, previous.neighbors), self.engine.real.type(ROUGH_SHARE)
+        start, share = (True, *previous.graph), self.engine.real.type(ROUGH_SHARE)
         if part.labels is not None:
             cut = replace(cut, state=UNSURE_CORNERS)
         self._clip(part, binned, cut, start, True, FACE_CAPACITY, share, part.halo_args, report)

@@ -144,7 +144,7 @@ class _Rounds:
         self._further = engine.scratch(most * MORE, np.int32)
         old = previous.vertices or (self._listed, self._listed)
         self._box = box
-        self._before = (previous.starts, previous.neighbors, np.int32(bool(previous.vertices)), *old, points)
+        self._before = (*previous.graph, np.int32(bool(previous.vertices)), *old, points)
         self._output = (np.int32(self.room), *self.cut.output(report), self.cut.keys, self._changed)
         engine.run_each(
             kernels.begin_cell_updates, n, np.int32(before), np.int32(SIZE), report, self._marks, self._more

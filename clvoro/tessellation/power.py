@@ -58,7 +58,7 @@ class Rings:
             return t.face_measures
         if self._arcs is None or len(self._arcs) < len(t.face_measures):
             self._arcs = engine.empty(len(t.face_measures), engine.face)
-        faces = t.starts, t.neighbors, t.sites, t.face_measures, t.face_centroids
+        faces = *t.graph, t.sites, t.face_measures, t.face_centroids
         engine.run_each(self._kernels.weigh_arcs, t.n, *faces, self._arcs)
         return self._arcs
 
@@ -86,5 +86,5 @@ class Rings:
                 return t, False
             if not excess < PROGRESS * before:
                 break
-            rows, before = NeighborRows(t.n, t.starts, t.neighbors), excess
+            rows, before = NeighborRows(t.n, *t.graph), excess
         return None, False

@@ -45,7 +45,7 @@ class VertexNumbering:
         m = int(t.starts[t.n].get())
         owners, ids = engine.empty(m, np.int32), engine.empty(m + 1, np.int32)
         endless = engine.zeros(1, np.int32)
-        engine.run_each(k.find_vertex_owners, t.n, t.starts, t.neighbors, owners, ids, endless)
+        engine.run_each(k.find_vertex_owners, t.n, *t.graph, owners, ids, endless)
         self._scan.exclusive(ids, ids, m)
         count, cell = int(ids[m].get()), int(endless.get()[0]) - 1
         if cell >= 0:
@@ -60,8 +60,7 @@ class VertexNumbering:
             t.n,
             t.sites,
             *box.device_corners(engine.real),
-            t.starts,
-            t.neighbors,
+            *t.graph,
             owners,
             ids,
             cell_vertices,

@@ -91,8 +91,7 @@ class QualityDescent:
             engine.run_each(
                 k.descend_quality,
                 t.n,
-                rows.starts,
-                rows.neighbors,
+                *rows.graph,
                 rows.face_measures,
                 rows.face_centroids,
                 t.points,
@@ -118,14 +117,7 @@ class QualityDescent:
         with engine.workspace.frame():
             counts, sums = (engine.scratch(n + 1, np.int32) for _ in range(2))
             engine.run_each(
-                self._kernels.open_obtuse_triangles,
-                n,
-                t.starts,
-                t.neighbors,
-                t.points,
-                displacement,
-                counts,
-                *engine.period_args,
+                self._kernels.open_obtuse_triangles, n, *t.graph, t.points, displacement, counts, *engine.period_args
             )
             self._scan.exclusive(counts, sums, n)
             return read_number(sums, n)

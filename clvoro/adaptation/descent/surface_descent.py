@@ -51,8 +51,7 @@ class SurfaceDescent:
             engine.run_each(
                 k.descend_surface,
                 t.n,
-                t.starts,
-                t.neighbors,
+                *t.graph,
                 t.face_measures,
                 t.face_centroids,
                 t.vertices[0],

@@ -127,7 +127,7 @@ class Boundary:
         vertices, inner = self.vertices, self.inner
         if any(shift):
             vertices, inner = (engine.upload(places + shift) for places in self._places)
-        graph = (t.starts, t.neighbors, t.sites)
+        graph = (*t.graph, t.sites)
         if t.n < self._known:
             self.owners.fill(0)
         self._known = t.n

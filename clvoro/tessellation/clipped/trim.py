@@ -81,8 +81,7 @@ class Trim:
         engine, k, room = self.engine, self._kernels, self._room
         u, places = chords.touched_count, chords.count + chords.touched_count
         cells = (
-            convex.starts,
-            convex.neighbors,
+            *convex.graph,
             convex.sites,
             *domain.device_corners(engine.real),
             chords.touched,
@@ -95,8 +94,7 @@ class Trim:
             engine.run_each(
                 k.find_outside,
                 n,
-                convex.starts,
-                convex.neighbors,
+                *convex.graph,
                 convex.sites,
                 *chords.arrays[:2],
                 np.int32(len(chords.tangents)),
@@ -128,16 +126,7 @@ class Trim:
         engine.run_each(k.write_segments, u, *cells, loops, pieces, starts, *parts)
         segments = (starts, *parts)
         engine.run_each(
-            k.check_segments,
-            u,
-            np.int32(n),
-            *segments,
-            chords.touched,
-            chords.slots,
-            roots,
-            convex.starts,
-            convex.neighbors,
-            self._flags,
+            k.check_segments, u, np.int32(n), *segments, chords.touched, chords.slots, roots, *convex.graph, self._flags
         )
         self._demand(int(read_number(self._flags, 0)))
         marks = room.zeros("marks", size=n, dtype=np.int32)
@@ -219,8 +208,7 @@ class Trim:
         self.engine.run_each(
             self._kernels.copy_whole,
             len(found.marks),
-            convex.starts,
-            convex.neighbors,
+            *convex.graph,
             convex.face_measures,
             convex.face_centroids,
             *found.segments,

@@ -159,8 +159,7 @@ class GhostImages:
         engine.run_each(
             self._kernels.scale_far_measures,
             t.n,
-            t.starts,
-            t.neighbors,
+            *t.graph,
             codes,
             t.face_measures,
             t.sites,
@@ -177,8 +176,7 @@ class GhostImages:
         self.engine.run_each(
             self._kernels.unfold_rows,
             n,
-            previous.starts,
-            previous.neighbors,
+            *previous.graph,
             part.points,
             ghosts.firsts,
             ghosts.codes,
@@ -270,8 +268,7 @@ class GhostImages:
         engine.run_each(
             self._kernels.fold_rows,
             n,
-            t.starts,
-            t.neighbors,
+            *t.graph,
             t.face_measures,
             t.volumes,
             t.points,

@@ -53,7 +53,7 @@ def list_half_faces(engine: Engine, box: ClipBox, t: Tessellation) -> HalfFaces:
     """
     n, scan = t.n, Scan(engine)
     corner_starts, starts = engine.empty(n + 1, np.int32), engine.empty(n + 1, np.int32)
-    cell = (t.sites, *box.clip_args(engine), t.starts, t.neighbors)
+    cell = (t.sites, *box.clip_args(engine), *t.graph)
     capacities, full = engine.zeros(n, np.int32), engine.zeros(1, np.int32)
     counts, used = (capacities, corner_starts, starts, full), [FACE_CAPACITY]
     while True:
