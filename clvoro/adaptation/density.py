@@ -73,18 +73,8 @@ class Density:
         w = LloydWeights(engine.scratch(t.n), engine.scratch(t.n), log_ratio, gradient, lloyd)
         with engine.workspace.frame():
             log_h = self._evaluate(t, h, w)
-            engine.run_each(
-                k.fit_gradient,
-                t.n,
-                *t.graph,
-                t.points,
-                log_h,
-                t.offsets,
-                t.covariances,
-                gradient,
-                lloyd,
-                *engine.period_args,
-            )
+            cells = t.points, log_h, t.offsets, t.covariances
+            engine.run_each(k.fit_gradient, t.n, *t.graph, *cells, gradient, lloyd, *engine.period_args)
         return w
 
     def sum_log_ratio(self, w: CellWeights) -> cla.Array:

@@ -49,6 +49,19 @@ class Generators:
 
 
 @dataclass(frozen=True)
+class Present:
+    """What is changed: the generators of a part, and their diagram `t`, which has labels if there are other parts."""
+
+    domain: Domain
+    t: Tessellation
+    generators: Generators
+    next_label: int
+    """First label of new generators."""
+    fixed: int = 0
+    """Generators with labels below it do not change."""
+
+
+@dataclass(frozen=True)
 class Outcome:
     """The generators of a part after insertions and deletions, and how many all parts have inserted and deleted."""
 
@@ -103,126 +116,75 @@ class InsertionDeletion:
         """Free all buffers."""
         self._room.clear()
 
-    def insert_delete(
-        self,
-        domain: Domain,
-        t: Tessellation,
-        sizes: CellSizes,
-        generators: Generators,
-        next_label: int,
-        change: Change,
-        fixed: int = 0,
-    ) -> Outcome | None:
-        """Nucleate dislocations, let them climb, and correct the number of generators.
+    def insert_delete(self, present: Present, sizes: CellSizes, change: Change) -> Outcome | None:
+        """Nucleate dislocations, let them climb, and correct the number of generators. None if nothing changes.
 
-        All parts of a domain call this together, with labels in their diagrams.
-
-        - `generators`: the present ones.
-        - `next_label`: first label of new generators.
-        - `fixed`: generators with labels below `fixed` do not change, and next to them only the number is corrected.
-
-        None if nothing changes.
+        All parts of a domain call this together. Next to fixed generators only the number is corrected.
         """
+        t = present.t
         n = self._count(t)
         # A remainder of less than 0.7 generators only changes the sizes of cells. A large change takes several calls.
         need = math.trunc(change.missing + math.copysign(0.3, change.missing))
         most = max(4, int(MAX_CHANGE * n))
         need = max(-most, min(most, need))
         marks = _Marks.clean(self._room, t, self.engine.dim)
-        self._labels, self._fixed = generators.labels, fixed
         if change.climb:
             kinds, strain_1, strain_2 = self._measure(t, sizes.h)
             if change.nuclei:
-                self._nucleate(t, kinds, strain_1, marks, change.nuclei)
-            gained = self._climb(t, sizes.local_length, kinds, strain_2, marks, need, change)
+                self._nucleate(present, kinds, strain_1, marks, change.nuclei)
+            gained = self._climb(present, sizes.local_length, kinds, strain_2, marks, need, change)
             # Free memory, because the generators will exist twice.
             del kinds, strain_1, strain_2
             self._room.clear("kinds", "strain", "partners", "pull", "merged")
             rest = need - gained
             if abs(rest) > max(2, abs(need) // 10) or (need and not gained):
-                self._split_or_delete(t, sizes.log_ratio, marks, rest)
+                self._split_or_delete(present, sizes.log_ratio, marks, rest)
         elif need:
-            self._split_or_delete(t, sizes.log_ratio, marks, need)
+            self._split_or_delete(present, sizes.log_ratio, marks, need)
         self._room.clear("keys", "spread", "chosen", "latest", "ranks")
-        return self._apply(domain, t, generators, marks, next_label)
+        return self._apply(present, marks)
 
     def repair_cells(
-        self,
-        domain: Domain,
-        t: Tessellation,
-        quality: cla.Array,
-        generators: Generators,
-        next_label: int,
-        deficit: float,
-        split: bool = False,
-        fixed: int = 0,
-        share: float = REPAIRED_SHARE,
+        self, present: Present, quality: cla.Array, deficit: float, split: bool = False, share: float = REPAIRED_SHARE
     ) -> Outcome | None:
-        """Delete or split the worst inner cells of a mesh in 2D.
+        """Delete or split the worst inner cells of a mesh in 2D. None if nothing changes.
 
         A very bad cell is where lattice defects are stuck in a poor arrangement. One generator less, or more, leads to
         another arrangement, which is usually better.
 
         - `quality`: (n,) real
-        - `generators`, `next_label`, `fixed`: as for `insert_delete`.
         - `deficit`: 1 - Q above which a cell is repaired.
         - `split`: split six-sided cells; otherwise delete them. Cells of more sides are split, cells of fewer deleted.
         - `share`: largest share of the cells to repair. A mesh for which that is less than one cell does not change.
-
-        None if nothing changes.
         """
+        t = present.t
         engine, k, n = self.engine, self._kernels, t.n
         most = int(share * self._count(t))
         if most == 0:
             return None
         marks = _Marks.clean(self._room, t, engine.dim)
-        self._labels, self._fixed = generators.labels, fixed
         keys = self._keys(t)
         deficit = engine.real.type(deficit)
         engine.run_each(k.score_bad_cells, n, *t.graph, quality, deficit, *t.name_args, keys)
-        self._drop_fixed(t, keys, neighbors=True)
+        self._drop_fixed(present, keys, neighbors=True)
         chosen = self._choose(t, keys, PAIR_RINGS)
         self._limit(t, chosen, most)
-        engine.run_each(
-            k.mark_bad_cells,
-            n,
-            chosen,
-            t.starts,
-            np.int32(6 if split else 7),
-            t.points,
-            t.offsets,
-            t.covariances,
-            t.volumes,
-            *marks.arrays,
-        )
+        cells = t.points, t.offsets, t.covariances, t.volumes
+        engine.run_each(k.mark_bad_cells, n, chosen, t.starts, np.int32(6 if split else 7), *cells, *marks.arrays)
         self._room.clear("keys", "spread", "chosen", "latest")
-        return self._apply(domain, t, generators, marks, next_label)
+        return self._apply(present, marks)
 
-    def split_delete(
-        self,
-        domain: Domain,
-        t: Tessellation,
-        generators: Generators,
-        next_label: int,
-        sites: tuple[cla.Array, cla.Array],
-        fixed: int = 0,
-    ) -> Outcome | None:
+    def split_delete(self, present: Present, sites: tuple[cla.Array, cla.Array]) -> Outcome | None:
         """Split and delete cells at `sites`, each (n,) uint64 and not 0 at sites; otherwise as `insert_delete`."""
-        engine, marks = self.engine, _Marks.clean(self._room, t, self.engine.dim)
-        self._labels, self._fixed = generators.labels, fixed
+        t, marks = present.t, _Marks.clean(self._room, present.t, self.engine.dim)
         for sign, chosen in zip((1, -1), sites, strict=True):
-            engine.run_each(
-                self._kernels.mark_split_delete,
-                t.n,
-                chosen,
-                engine.real.type(sign),
-                t.points,
-                t.offsets,
-                t.covariances,
-                t.volumes,
-                *marks.arrays,
-            )
-        return self._apply(domain, t, generators, marks, next_label)
+            self._mark_split_delete(t, chosen, self.engine.real.type(sign), marks)
+        return self._apply(present, marks)
+
+    def _mark_split_delete(self, t: Tessellation, chosen: cla.Array, sign: np.floating, marks: _Marks) -> None:
+        """Mark to split the `chosen` cells, or to delete them if `sign` is negative."""
+        cells = t.points, t.offsets, t.covariances, t.volumes
+        self.engine.run_each(self._kernels.mark_split_delete, t.n, chosen, sign, *cells, *marks.arrays)
 
     def _measure(self, t: Tessellation, h: cla.Array) -> tuple[cla.Array, cla.Array, cla.Array]:
         """Return charge and number of walls (n, 2), and the strain averaged over one and over two rings (n, 4)."""
@@ -246,12 +208,12 @@ class InsertionDeletion:
         """Return the number of generators of all parts."""
         return int(self.engine.peers.total(t.n))
 
-    def _nucleate(self, t: Tessellation, kinds: cla.Array, strain: cla.Array, marks: _Marks, nuclei: int) -> None:
+    def _nucleate(self, present: Present, kinds: cla.Array, strain: cla.Array, marks: _Marks, nuclei: int) -> None:
         """Mark at most `nuclei` insertions and as many mergers where the perfect lattice is strained most."""
-        engine, k, n = self.engine, self._kernels, t.n
+        engine, k, t, n = self.engine, self._kernels, present.t, present.t.n
         keys, names, limit = self._keys(t), t.name_args, engine.real.type(NUCLEATION_STRAIN)
         engine.run_each(k.score_strain, n, *t.graph, kinds, strain, limit, *names, keys)
-        self._drop_fixed(t, keys, neighbors=True)
+        self._drop_fixed(present, keys, neighbors=True)
         chosen = self._choose(t, keys, NUCLEUS_RINGS)
         self._limit(t, chosen, 2 * nuclei)
         ranks = self._room("ranks", size=n + 1, dtype=np.int32)
@@ -260,28 +222,16 @@ class InsertionDeletion:
         peers = engine.peers
         first = int(peers.before(ranks[n:].get())[0]) if peers.count > 1 else 0
         merged = self._room("merged", size=t.rows, dtype=np.int32)
+        made = marks.shifts, marks.born, marks.births, marks.busy, merged
         engine.run_each(
-            k.mark_nuclei,
-            n,
-            chosen,
-            ranks,
-            np.int32(first),
-            *t.graph,
-            t.points,
-            *names,
-            marks.shifts,
-            marks.born,
-            marks.births,
-            marks.busy,
-            merged,
-            *engine.period_args,
+            k.mark_nuclei, n, chosen, ranks, np.int32(first), *t.graph, t.points, *names, *made, *engine.period_args
         )
         t.forward(engine, merged)
         engine.run_each(k.delete_merged, n, *t.graph, merged, *names, marks.kept)
 
     def _climb(
         self,
-        t: Tessellation,
+        present: Present,
         local_length: cla.Array,
         kinds: cla.Array,
         strain: cla.Array,
@@ -294,25 +244,14 @@ class InsertionDeletion:
         The threshold is shifted so that the change is closest to `need`. Nucleated pairs and their neighborhood do not
         climb.
         """
-        engine, k, n = self.engine, self._kernels, t.n
+        engine, k, t, n = self.engine, self._kernels, present.t, present.t.n
         real, strain_limit = engine.real.type, engine.real.type(change.climb_strain)
         partners = self._room("partners", size=4 * t.rows, dtype=np.int32).reshape(-1, 4)
         pull, keys, names = self._room("pull", size=t.rows), self._keys(t), t.name_args
-        engine.run_each(
-            k.score_pairs,
-            n,
-            *t.graph,
-            t.points,
-            kinds,
-            strain,
-            np.int32(change.climb_strain <= CLIMB_STRAIN),
-            *names,
-            partners,
-            pull,
-            keys,
-            *engine.period_args,
-        )
-        self._drop_fixed(t, keys, neighbors=True)
+        lattice = *t.graph, t.points, kinds, strain, np.int32(change.climb_strain <= CLIMB_STRAIN)
+        pairs = partners, pull, keys
+        engine.run_each(k.score_pairs, n, *lattice, *names, *pairs, *engine.period_args)
+        self._drop_fixed(present, keys, neighbors=True)
         if change.nuclei:
             engine.run_each(k.drop_sites, n, self.spread(t, marks.busy, PAIR_RINGS), keys)
         chosen = self._choose(t, keys, PAIR_RINGS)
@@ -324,43 +263,28 @@ class InsertionDeletion:
         order = np.argsort(np.abs(shifts), kind="stable")
         best = order[np.argmin(np.abs(changes[order] - need))]
         t.forward(engine, chosen, pull, partners)
-        engine.run_each(
-            k.mark_pairs,
-            n,
-            *t.graph,
-            chosen,
-            pull,
-            kinds,
-            partners,
-            strain_limit,
-            real(shifts[best]),
-            *names,
-            t.points,
-            local_length,
-            *marks.arrays,
-            marks.busy,
-            *engine.period_args,
-        )
+        pairs = chosen, pull, kinds, partners, strain_limit, real(shifts[best])
+        moved = t.points, local_length, *marks.arrays, marks.busy
+        engine.run_each(k.mark_pairs, n, *t.graph, *pairs, *names, *moved, *engine.period_args)
         return int(changes[best])
 
-    def _split_or_delete(self, t: Tessellation, log_ratio: cla.Array, marks: _Marks, rest: int) -> None:
+    def _split_or_delete(self, present: Present, log_ratio: cla.Array, marks: _Marks, rest: int) -> None:
         """Mark about `rest` of the largest cells to split, or -rest of the smallest to delete, relative to h."""
-        engine, k, n = self.engine, self._kernels, t.n
+        engine, k, t, n = self.engine, self._kernels, present.t, present.t.n
         sign, keys = engine.real.type(math.copysign(1, rest)), self._keys(t)
         engine.run_each(k.score_log_ratio, n, *t.graph, log_ratio, sign, *t.name_args, keys)
-        self._drop_fixed(t, keys, neighbors=False)
+        self._drop_fixed(present, keys, neighbors=False)
         engine.run_each(k.drop_sites, n, self.spread(t, marks.busy, LOG_RATIO_RINGS), keys)
         chosen = self._choose(t, keys, LOG_RATIO_RINGS)
         self._limit(t, chosen, rest if rest > 0 else min(-rest, self._count(t) - 1))
-        engine.run_each(
-            k.mark_split_delete, n, chosen, sign, t.points, t.offsets, t.covariances, t.volumes, *marks.arrays
-        )
+        self._mark_split_delete(t, chosen, sign, marks)
 
-    def _drop_fixed(self, t: Tessellation, keys: cla.Array, neighbors: bool) -> None:
+    def _drop_fixed(self, present: Present, keys: cla.Array, neighbors: bool) -> None:
         """Remove sites at fixed generators and, with `neighbors`, next to them."""
-        if self._fixed:
+        if present.fixed:
+            t = present.t
             with self.engine.workspace.frame():
-                labels = t.fixed_args(self.engine, self._labels, self._fixed)
+                labels = t.fixed_args(self.engine, present.generators.labels, present.fixed)
                 drop = self._kernels.drop_fixed_sites
                 self.engine.run_each(drop, t.n, *t.graph, *labels, np.int32(neighbors), keys)
 
@@ -376,11 +300,10 @@ class InsertionDeletion:
             source, into, other = into, other, into
         return source if at_once % 2 else into
 
-    def choose_once(self, t: Tessellation, keys: cla.Array, rings: int, labels: cla.Array, fixed: int) -> cla.Array:
+    def choose_once(self, present: Present, keys: cla.Array, rings: int) -> cla.Array:
         """Return the keys of the sites that are the strongest within `rings` rings, away from fixed generators."""
-        self._labels, self._fixed = labels, fixed
-        self._drop_fixed(t, keys, neighbors=True)
-        return self._choose(t, keys, rings, rounds=1)
+        self._drop_fixed(present, keys, neighbors=True)
+        return self._choose(present.t, keys, rings, rounds=1)
 
     def _choose(self, t: Tessellation, keys: cla.Array, rings: int, rounds: int = ROUNDS) -> cla.Array:
         """Return the keys of the strongest sites that are `rings` rings apart. `keys` is overwritten."""
@@ -413,16 +336,14 @@ class InsertionDeletion:
             low, span = least - width, width
         engine.run_each(k.limit_sites, t.n, np.uint64(min(least, 2**64 - 1)), chosen)
 
-    def _apply(
-        self, domain: Domain, t: Tessellation, generators: Generators, marks: _Marks, next_label: int
-    ) -> Outcome | None:
+    def _apply(self, present: Present, marks: _Marks) -> Outcome | None:
         """Carry out the marked changes."""
-        engine, n = self.engine, t.n
+        engine, t, generators = self.engine, present.t, present.generators
         totals = self._room("totals", size=2, dtype=np.int32)
         for place, counts in enumerate((marks.kept, marks.born)):
-            self._scan.exclusive(counts, counts, n, total=(totals, place))
+            self._scan.exclusive(counts, counts, t.n, total=(totals, place))
         kept, born = found = totals.get()
-        first = next_label + int(engine.peers.before(found)[1])
+        first = present.next_label + int(engine.peers.before(found)[1])
         (left, inserted), deleted = engine.peers.total(found).tolist(), self._count(t)
         deleted -= left
         m = int(kept + born)
@@ -435,30 +356,10 @@ class InsertionDeletion:
             engine.empty(m, np.uint64),
             engine.empty(m),
         )
-        engine.run_each(
-            self._kernels.apply_changes,
-            n,
-            marks.kept,
-            marks.born,
-            np.int32(first),
-            np.int32(self._fixed),
-            *domain.device_args(engine),
-            t.points,
-            generators.labels,
-            generators.velocity,
-            generators.signatures,
-            generators.ever_changed,
-            marks.shifts,
-            marks.births,
-            new.points,
-            new.labels,
-            new.velocity,
-            new.signatures,
-            new.ever_changed,
-            *t.graph,
-            t.face_centroids,
-            *t.outlines,
-        )
+        changes = marks.kept, marks.born, np.int32(first), np.int32(present.fixed), *present.domain.device_args(engine)
+        before = t.points, *list(vars(generators).values())[1:], marks.shifts, marks.births
+        mesh = *t.graph, t.face_centroids, *t.outlines
+        engine.run_each(self._kernels.apply_changes, t.n, *changes, *before, *vars(new).values(), *mesh)
         return Outcome(new, inserted, deleted)
 
 

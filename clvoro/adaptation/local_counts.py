@@ -89,19 +89,10 @@ class LocalCounts:
             if turn:
                 if pieces is not None:
                     pieces.offset(potential, changes)
-                engine.run_each(
-                    k.score_potential,
-                    n,
-                    *t.graph,
-                    w.log_ratio,
-                    potential,
-                    offset,
-                    real(LEAST_GAIN),
-                    selection.spread(t, blocked, BLOCKED_RINGS),
-                    *t.name_args,
-                    keys,
-                )
-                chosen = selection.choose_once(t, keys, SITE_RINGS, mesh.labels, mesh.fixed)
+                gains = w.log_ratio, potential, offset, real(LEAST_GAIN)
+                away = selection.spread(t, blocked, BLOCKED_RINGS)
+                engine.run_each(k.score_potential, n, *t.graph, *gains, away, *t.name_args, keys)
+                chosen = selection.choose_once(mesh.present, keys, SITE_RINGS)
             engine.run_each(k.try_changes, n, w.weight, changes, chosen, potential, offset, before, source)
             balance_components(mesh.engine, mesh.domain, t, source, w.weight)
             poisson.solve(
@@ -117,18 +108,9 @@ class LocalCounts:
             if pieces is not None:
                 pieces.offset(potential, changes)
             self._accepted.fill(0)
-            engine.run_each(
-                k.accept_changes,
-                n,
-                chosen,
-                before,
-                potential,
-                offset,
-                real(LEAST_GAIN),
-                changes,
-                blocked,
-                self._accepted,
-            )
+            gains = chosen, before, potential, offset, real(LEAST_GAIN)
+            found = changes, blocked, self._accepted
+            engine.run_each(k.accept_changes, n, *gains, *found)
             inserted, deleted = map(int, engine.peers.total(read_numbers(self._accepted, 0, 2)))
             missing, total = missing - inserted + deleted, total + inserted + deleted
             if inserted + deleted <= LEAST_CHANGES * mesh.total:

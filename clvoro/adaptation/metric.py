@@ -49,22 +49,10 @@ class Metric:
         if compared is not None:
             labels, *arrays, first = compared
             sets = (2 if first else 1, t.neighbors, t.names(self.engine, labels), *arrays)
+        faces = t.volumes, t.starts, t.face_measures, int(t.face_measures.dtype == self.engine.real)
+        found = h, error, quality, energy, local_length
         self.engine.run_each(
-            self._kernels.evaluate_metric,
-            t.n,
-            t.volumes,
-            t.starts,
-            t.face_measures,
-            int(t.face_measures.dtype == self.engine.real),
-            t.offsets,
-            t.covariances,
-            h,
-            error,
-            quality,
-            energy,
-            local_length,
-            *sets,
-            *t.outlines,
+            self._kernels.evaluate_metric, t.n, *faces, t.offsets, t.covariances, *found, *sets, *t.outlines
         )
 
     def set_fixed_sizes(self, labels: cla.Array, first: int, fixed: int, volumes: cla.Array, h: cla.Array) -> None:

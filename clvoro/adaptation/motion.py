@@ -88,18 +88,9 @@ class Motion:
     def compute_potential_gradient(self, t: Tessellation, psi: cla.Array, u: cla.Array) -> None:
         """Write u = grad psi = -grad phi, the paper's (3.3), to `u` (n, d); `psi` (n,) real is the potential psi."""
         with self.engine.workspace.frame():
-            self.engine.run_each(
-                self._kernels.compute_potential_gradient,
-                t.n,
-                *t.graph,
-                t.face_measures,
-                t.face_centroids,
-                t.volumes,
-                t.points,
-                *t.with_ghosts(self.engine, psi),
-                u,
-                *self.engine.period_args,
-            )
+            cells = *t.graph, t.face_measures, t.face_centroids, t.volumes, t.points
+            given = *cells, *t.with_ghosts(self.engine, psi), u, *self.engine.period_args
+            self.engine.run_each(self._kernels.compute_potential_gradient, t.n, *given)
 
     def relax_correction(self, summaries: Summaries, name: str, limit: float, k: float, u: cla.Array) -> None:
         """Scale `u` (n, d) by alpha = min(limit, k / max(|u| / h)), the paper's (3.5).
@@ -114,36 +105,17 @@ class Motion:
     def move_generators(self, domain: Domain, points: cla.Array, d: Displacement, velocity: cla.Array) -> None:
         """Move `points` (n, d) by `d` inside `domain`. `velocity` (n, d) becomes what they have moved by."""
         real = self.engine.real.type
+        parts = d.lloyd, real(d.lloyd_share), d.correction, real(d.correction_share), d.unit, real(d.bound)
         self.engine.run_each(
-            self._kernels.move_generators,
-            d.unit.shape[0],
-            d.lloyd,
-            real(d.lloyd_share),
-            d.correction,
-            real(d.correction_share),
-            d.unit,
-            real(d.bound),
-            *domain.device_args(self.engine),
-            points,
-            velocity,
+            self._kernels.move_generators, d.unit.shape[0], *parts, *domain.device_args(self.engine), points, velocity
         )
 
     def leave_balls(self, domain: Domain, t: Tessellation, balls: Balls, moving: Moving) -> None:
         """Move generators out of `balls`; `t` is a diagram of nearly the same generators."""
-        self.engine.run_each(
-            self._kernels.leave_balls,
-            t.n,
-            *t.graph,
-            *t.fixed_args(self.engine, moving.labels, moving.fixed),
-            np.int32(balls.first),
-            np.int32(balls.count),
-            balls.starts,
-            balls.spheres,
-            np.int32(BALL_PASSES),
-            *domain.device_args(self.engine),
-            moving.points,
-            moving.velocity,
-        )
+        around = np.int32(balls.first), np.int32(balls.count), balls.starts, balls.spheres, np.int32(BALL_PASSES)
+        fixed = t.fixed_args(self.engine, moving.labels, moving.fixed)
+        moved = *domain.device_args(self.engine), moving.points, moving.velocity
+        self.engine.run_each(self._kernels.leave_balls, t.n, *t.graph, *fixed, *around, *moved)
 
     def zero_fixed_displacements(self, labels: cla.Array, fixed: int, displacement: cla.Array) -> None:
         """Set `displacement` (n, d) to 0 for generators whose label is below `fixed`."""

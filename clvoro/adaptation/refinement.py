@@ -40,21 +40,10 @@ class Refinement:
         fixed_args = *t.fixed_args(engine, labels, fixed), *t.name_args
         starts = self._child_starts(t, *fixed_args)
         finer = engine.empty((n + int(starts[n].get()), engine.dim))
+        cells = *t.graph, t.face_measures, t.volumes, t.points
+        made = starts, finer, t.face_centroids, *t.outlines
         engine.run_each(
-            k.place_new_generators,
-            n,
-            *t.graph,
-            t.face_measures,
-            t.volumes,
-            t.points,
-            *fixed_args,
-            h,
-            np.int32(n),
-            *domain.device_args(engine),
-            starts,
-            finer,
-            t.face_centroids,
-            *t.outlines,
+            k.place_new_generators, n, *cells, *fixed_args, h, np.int32(n), *domain.device_args(engine), *made
         )
         # Several cells that are much larger than the edges of the boundary can bring one at the same corner.
         if len(finer) <= most_checked(domain):

@@ -31,7 +31,7 @@ from ..tessellation.readback.parts import fetch_part
 from ..tessellation.tessellator import Tessellator
 from .density import CellWeights
 from .fixed_points import clear_balls, find_places, near_places, put_fixed, take_places
-from .insertion_deletion import CellSizes, Change, Generators, Outcome
+from .insertion_deletion import CellSizes, Change, Generators, Outcome, Present
 from .metric import Neighborhoods
 from .motion import Balls, Displacement, Moving
 from .stages import Stages
@@ -283,6 +283,11 @@ class MeshState:
         """The generators, to be moved."""
         return Moving(self.points, self.velocity, self.labels, self.fixed)
 
+    @property
+    def present(self) -> Present:
+        """The generators, to be inserted and deleted."""
+        return Present(self.free, self.t, self._data.generators, self.next_label, self.fixed)
+
     def ordered(self, array: cla.Array) -> np.ndarray:
         """Return `array` (n, ...) on the host in the order of labels."""
         # The labels are a new array whenever the order changes.
@@ -518,25 +523,17 @@ class MeshState:
             w = self.stages.density.cell_weights(self.t, self.h)
             missing = self.missing_cells(w) if n_cells is None else float(n_cells - self.total)
             missing = min(missing, most - self.total)
-            new = self.stages.insertion_deletion.insert_delete(
-                self.free,
-                self.t,
-                CellSizes(self.h, self.local_length, w.log_ratio),
-                self._data.generators,
-                self.next_label,
-                Change(missing, nuclei, climb, climb_strain),
-                self.fixed,
-            )
+            sizes = CellSizes(self.h, self.local_length, w.log_ratio)
+            change = Change(missing, nuclei, climb, climb_strain)
+            new = self.stages.insertion_deletion.insert_delete(self.present, sizes, change)
         rows, counts = _take_apart(new)
-        del new, w
+        del new, w, sizes
         return self._replace(rows, counts)
 
     def repair_cells(self, deficit: float, split: bool) -> tuple[int, int]:
         """Delete or split the worst cells (see `InsertionDeletion.repair_cells`); return the numbers of both."""
         self.engine.workspace.shrink()
-        new = self.stages.insertion_deletion.repair_cells(
-            self.free, self.t, self.quality, self._data.generators, self.next_label, deficit, split, self.fixed
-        )
+        new = self.stages.insertion_deletion.repair_cells(self.present, self.quality, deficit, split)
         rows, counts = _take_apart(new)
         del new
         return self._replace(rows, counts)
@@ -554,9 +551,7 @@ class MeshState:
             changes = engine.scratch(self.n, np.int32)
             if stages.local_counts.choose(self, w, changes):
                 sites = (stages.local_counts.sites(changes, 1), stages.local_counts.sites(changes, -1))
-                new = stages.insertion_deletion.split_delete(
-                    self.free, self.t, self._data.generators, self.next_label, sites, self.fixed
-                )
+                new = stages.insertion_deletion.split_delete(self.present, sites)
         stages.clear_poisson()
         rows, counts = _take_apart(new)
         del new
@@ -575,9 +570,7 @@ class MeshState:
             sites = engine.zeros(self.n, np.uint64), engine.upload(small, np.uint64)
             new = None
             if small.any():
-                new = stages.insertion_deletion.split_delete(
-                    self.free, self.t, self._data.generators, self.next_label, sites, self.fixed
-                )
+                new = stages.insertion_deletion.split_delete(self.present, sites)
         rows, counts = _take_apart(new)
         del new
         self._replace(rows, counts)

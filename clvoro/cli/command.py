@@ -12,6 +12,7 @@ import sys
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext, redirect_stderr, redirect_stdout
+from dataclasses import fields
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -117,8 +118,8 @@ def _add_settings(run: Any) -> None:
         help="number of coarser levels to start from, or auto (the default; adaptive, exact, transport)",
     )
     run.add_argument("--start", choices=("density", "uniform"), help="random start: by h^-d, or uniform")
-    run.add_argument("--cells", metavar="N", type=int, help="number of cells (default: from h)")
-    run.add_argument("--steps", metavar="N", type=int, help="largest number of steps")
+    run.add_argument("--cells", metavar="N", type=int, dest="n_cells", help="number of cells (default: from h)")
+    run.add_argument("--steps", metavar="N", type=int, dest="max_steps", help="largest number of steps")
     repeated = "(methods of one kind of step)"
     run.add_argument("--tol", type=float, metavar="T", help=f"stop when gains fall below this share {repeated}")
     run.add_argument("--k", type=float, metavar="K", help=f"largest displacement over h in a step {repeated}")
@@ -142,6 +143,7 @@ def _add_output(run: Any) -> None:
     run.add_argument(
         "--format",
         metavar="LIST",
+        dest="mesh_formats",
         type=_mesh_formats,
         default=(),
         help=f"further mesh files, such as openfoam,nc: {', '.join(MESH_FILES)}",
@@ -158,12 +160,14 @@ def _add_output(run: Any) -> None:
     _add_unchecked(run)
     run.add_argument(
         "--check-solver",
+        dest="solver",
         choices=("openfoam",),
         help="check the mesh by the criteria of a solver, with its own program if that is installed",
     )
-    run.add_argument("--no-report", action="store_true", help="no pictures and no page")
+    run.add_argument("--no-report", dest="report", action="store_false", help="no pictures and no page")
     run.add_argument(
         "--picture-format",
+        dest="picture_formats",
         metavar="KIND",
         action="append",
         choices=("png", "pdf", "svg"),
@@ -171,7 +175,7 @@ def _add_output(run: Any) -> None:
     )
     run.add_argument("--profile", action="store_true", help="print where the time goes, by stage and by kernel")
     run.add_argument("--quiet", "-q", action="store_true", help="print errors only")
-    run.add_argument("--json", action="store_true", help="print one JSON object per finished run")
+    run.add_argument("--json", dest="as_json", action="store_true", help="print one JSON object per finished run")
 
 
 def _add_types(command: Any) -> None:
@@ -443,42 +447,21 @@ def _run(arguments: argparse.Namespace) -> int:
     case = case.with_run(
         method=methods[0] if len(methods) == 1 else None,
         methods=methods if len(methods) > 1 else None,
-        start=arguments.start,
-        n_cells=arguments.cells,
-        max_steps=arguments.steps,
-        tol=arguments.tol,
-        k=arguments.k,
-        seed=arguments.seed,
-        dtype=arguments.dtype,
-        effort=arguments.effort,
         levels=_level_count(arguments.levels),
+        **_taken(arguments, "start", "n_cells", "max_steps", "tol", "k", "seed", "dtype", "effort"),
     )
-    job = Job(
-        case,
-        arguments.out or Path("out") / case.name,
-        device=arguments.device,
-        report=not arguments.no_report,
-        mesh_formats=arguments.format,
-        picture_formats=tuple(arguments.picture_format or ["png"]),
-        quiet=arguments.quiet,
-        as_json=arguments.json,
-        profile=arguments.profile,
-        checkpoint=arguments.checkpoint,
-        checkpoint_every=arguments.checkpoint_every,
-        resume=arguments.resume,
-        walls=arguments.walls,
-        types=arguments.types,
-        unchecked=arguments.unchecked,
-        command=tuple(arguments.given),
-        solver=arguments.check_solver,
-        processors=arguments.processors,
-        peers=arguments.peers,
-        pieces=arguments.pieces,
-        share_gpus=arguments.share_gpus,
-    )
+    arguments.out = arguments.out or Path("out") / case.name
+    arguments.picture_formats = tuple(arguments.picture_formats or ["png"])
+    given = _taken(arguments, *(option.name for option in fields(Job) if option.init))
+    job = Job(**given | {"case": case, "command": tuple(arguments.given)})
     if job.run():
         return INTERRUPTED
     return FAILED if job.rejected or job.missed else OK
+
+
+def _taken(arguments: argparse.Namespace, *names: str) -> dict[str, Any]:
+    """Return the arguments of these names."""
+    return {name: getattr(arguments, name) for name in names}
 
 
 def _level_count(text: str | None) -> str | int | None:
@@ -571,22 +554,8 @@ def _foam_adapt(arguments: argparse.Namespace) -> int:
     adapt_case(
         arguments.case,
         n_cells=arguments.cells,
-        cycles=arguments.cycles,
-        solver=arguments.solver,
-        interval=arguments.interval,
-        window=arguments.window,
-        sizes=FieldSizes(
-            arguments.fields,
-            arguments.forces,
-            arguments.adjoints,
-            arguments.p,
-            arguments.h_min,
-            arguments.h_max,
-            arguments.growth,
-        ),
-        layers=arguments.layers,
-        mesh=arguments.mesh,
-        effort=arguments.effort,
+        sizes=FieldSizes(**_taken(arguments, "fields", "forces", "adjoints", "p", "h_min", "h_max", "growth")),
+        **_taken(arguments, "cycles", "solver", "interval", "window", "layers", "mesh", "effort"),
         pictures=not arguments.no_pictures,
         adapter=None if arguments.device is None else Adapter(create_context(arguments.device)),
         on_cycle=show,

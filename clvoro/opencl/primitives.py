@@ -118,16 +118,14 @@ class Summaries:
     def _combine(self, *notes: cla.Array) -> None:
         """Combine the partial summaries. The record also gets at most two int32 arrays, so that one read has all."""
         counts, arrays = [*map(len, notes), 0, 0], [*notes, self._record, self._record]
+        sums = counts[0], arrays[0], counts[1], arrays[1]
         self.engine.run_groups(
             self._kernels.combine_blocks,
             len(self.slots),
             self._partials,
             self.engine.groups,
             self._pending,
-            counts[0],
-            arrays[0],
-            counts[1],
-            arrays[1],
+            *sums,
             self._values,
             self._record,
         )

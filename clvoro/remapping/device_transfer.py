@@ -204,21 +204,9 @@ class ConservativeTransfer:
             periods,
         )
         while True:
-            engine.run_each(
-                self._kernels.fit_slopes,
-                n,
-                np.int32(width),
-                *rows,
-                *self._box,
-                data.means,
-                data.values,
-                np.int32(limited),
-                slopes,
-                least,
-                most,
-                status,
-                group=self._group,
-            )
+            cells = np.int32(width), *rows, *self._box, data.means, data.values, np.int32(limited)
+            found = slopes, least, most, status
+            engine.run_each(self._kernels.fit_slopes, n, *cells, *found, group=self._group)
             if not self._are_large(status.get(), np.arange(n), "the diagram of the values").size:
                 return replace(data, least=least, most=most, slopes=slopes)
 

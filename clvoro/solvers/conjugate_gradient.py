@@ -322,20 +322,8 @@ class _Iteration:
         partial, state, _ = self._tail
         self._launch(k.sum_right_sides, self._size, anew, self._rhs, self._q, partial)
         self._engine.sum_over_parts(PartialSums(partial, (_SUM_B, _START, _MAX_B), largest=_MAX_B))
-        self._launch(
-            k.start_residual,
-            self._size,
-            anew,
-            self._center,
-            self._rhs,
-            self._q,
-            self._x,
-            self._r,
-            self._p,
-            partial,
-            state,
-            self._solver.counts,
-        )
+        vectors = self._rhs, self._q, self._x, self._r, self._p
+        self._launch(k.start_residual, self._size, anew, self._center, *vectors, partial, state, self._solver.counts)
         totals = self._engine.sum_over_parts(PartialSums(partial, (_NORM_B, _NORM_R, _SUM_R)))
         if len(totals):
             self._target = (self._tolerance**2) * totals[0]

@@ -201,18 +201,8 @@ class Bins:
         for place, values in enumerate((self._flags, self._sizes)):
             self._scan.exclusive(values, values, size, total=(self._found, place))
         self._scan.exclusive(self._counts, self._starts, size, first=begin)
-        engine.run_each(
-            k.place_bins,
-            size,
-            self._starts,
-            first,
-            self._grid_of,
-            self._shapes,
-            self._grid_items,
-            np.int32(grids),
-            self._flags,
-            self._bins,
-        )
+        grid = self._grid_of, self._shapes, self._grid_items
+        engine.run_each(k.place_bins, size, self._starts, first, *grid, np.int32(grids), self._flags, self._bins)
         new_grids, new_bins = map(int, self._found.get())
         return new_grids, new_bins, self._sizes
 
@@ -221,18 +211,8 @@ class Bins:
         engine, k, end = self.engine, self._kernels, begin + size
         self._clear(self._counts, end, new_bins)
         grids = self._frames, self._shapes
-        engine.run_each(
-            k.make_grids,
-            size,
-            self._bins,
-            self._counts,
-            np.int32(begin),
-            np.int32(end),
-            firsts,
-            self._grid_of,
-            *grids,
-            self._grid_items,
-        )
+        bins = self._bins, self._counts, np.int32(begin), np.int32(end), firsts, self._grid_of
+        engine.run_each(k.make_grids, size, *bins, *grids, self._grid_items)
         engine.run_each(k.count_in_child_bins, n, points, self._bins, *grids, self._keys, self._ranks, self._counts)
 
     def renumber(self, binned: BinnedPoints, n: int) -> None:

@@ -110,17 +110,9 @@ class Cells(CellBuilder):
 
     def _request_depths(self, part: Part, binned: BinnedPoints, t: Tessellation) -> None:
         """Request the depths of the halo that the cells of `t` require. In 3D the kernels that clip cells do this."""
-        engine = self.engine
-        engine.run_each(
-            self._halo.measure_required_depths,
-            part.count,
-            binned.items,
-            binned.reach,
-            part.points,
-            *t.graph,
-            *part.box.device_corners(engine.real),
-            *part.halo_args,
-        )
+        box = part.box.device_corners(self.engine.real)
+        given = binned.items, binned.reach, part.points, *t.graph, *box, *part.halo_args
+        self.engine.run_each(self._halo.measure_required_depths, part.count, *given)
 
     def _clip(self, rows: FaceRows, part: Part, binned: BinnedPoints) -> tuple[int, int]:
         """Build and match the faces of the first ``rows.n`` cells of `part`, and return what `_match` returns."""
@@ -129,39 +121,15 @@ class Cells(CellBuilder):
         some = hulls is not None
         bounds = () if self._bounds is None else self._bounds.build(part.box, part.points, total)
         if hulls is not None:
-            engine.run_each(
-                hulls.wrap_all_hulls,
-                -(-total // (LANES * EIGHTS)),
-                np.int32(total),
-                np.int32(n),
-                binned.points,
-                binned.items,
-                binned.spacing,
-                *binned.search,
-                *rows.corners,
-                engine.real.type(FIRST_REACH),
-                rows.slots,
-                rows.counts,
-                rows.places,
-                group=1,
-            )
+            items = -(-total // (LANES * EIGHTS))
+            bins = binned.points, binned.items, binned.spacing, *binned.search
+            reach = engine.real.type(FIRST_REACH)
+            made = *rows.corners, reach, *rows.output
+            engine.run_each(hulls.wrap_all_hulls, items, np.int32(total), np.int32(n), *bins, *made, group=1)
         while True:
-            engine.run_each(
-                self._kernels.clip_polygons,
-                total,
-                np.int32(n),
-                binned.points,
-                binned.items,
-                *binned.search,
-                rows.points,
-                *rows.corners,
-                np.int32(some),
-                rows.slots,
-                rows.counts,
-                rows.places,
-                rows.report,
-                *bounds,
-            )
+            bins = binned.points, binned.items, *binned.search
+            made = np.int32(some), *rows.output, rows.report
+            engine.run_each(self._kernels.clip_polygons, total, np.int32(n), *bins, *rows.sites, *made, *bounds)
             found = self._match(rows)
             if not found[0] & FULL or found[0] & CROWDED:
                 return found
@@ -181,17 +149,7 @@ class Cells(CellBuilder):
         """
         n = previous.n
         rows = self.take_rows(n, box, points, exact, spare=spare_slots(n))
-        self.engine.run_each(
-            self._kernels.clip_by_rings,
-            n,
-            points,
-            *rows.corners,
-            *previous.graph,
-            rows.slots,
-            rows.counts,
-            rows.places,
-            rows.report,
-        )
+        self.engine.run_each(self._kernels.clip_by_rings, n, *rows.sites, *previous.graph, *rows.output, rows.report)
         flags, m = self._match(rows)
         return None if flags & ~DOUBT else self.measure(rows, m, flags)
 
@@ -222,25 +180,10 @@ class Cells(CellBuilder):
         neighbor lists the generator between the correct two neighbors; it becomes 0 where a face due to round-off is
         dropped.
         """
-        engine, starts = self.engine, rows.starts
-        engine.run_each(
-            self._kernels.match_polygon_faces,
-            rows.n,
-            rows.places,
-            rows.slots,
-            rows.counts,
-            *rows.old,
-            rows.points,
-            *rows.corners,
-            int(fits is not None),
-            rows.share,
-            rows.places if marks is None else marks,
-            rows.places if fits is None else fits,
-            rows.keep,
-            starts,
-            rows.report,
-        )
-        self._count(rows, starts)
+        updated = [rows.places if array is None else array for array in (marks, fits)]
+        given = *rows.input, *rows.sites, int(fits is not None), rows.share, *updated
+        self.engine.run_each(self._kernels.match_polygon_faces, rows.n, *given, rows.keep, rows.starts, rows.report)
+        self._count(rows, rows.starts)
 
     def _count(self, rows: FaceRows, counts: cla.Array) -> None:
         """Set `rows.starts` and the number of half-faces from the lengths of rows."""
@@ -272,42 +215,15 @@ class Cells(CellBuilder):
     def _measure_rows(self, rows: FaceRows, unless: tuple[object, ...], neighbors: cla.Array) -> None:
         """Write the graph of the rows to `neighbors`, and their measures, `unless` as `measure` says."""
         new, faces = self.cells_of(rows.n), self._faces
-        self.engine.run(
-            self._kernels.measure_cells,
-            -(-rows.n // self.lanes),
-            rows.n,
-            rows.places,
-            rows.slots,
-            rows.counts,
-            *rows.old,
-            rows.keep,
-            rows.starts,
-            rows.points,
-            *rows.corners,
-            *unless,
-            neighbors,
-            faces["face_measures"],
-            faces["face_centroids"],
-            new["volumes"],
-            new["offsets"],
-            new["covariances"],
-        )
+        made = faces["face_measures"], faces["face_centroids"], new["volumes"], new["offsets"], new["covariances"]
+        given = *rows.input, rows.keep, rows.starts, *rows.sites, *unless, neighbors
+        self.engine.run(self._kernels.measure_cells, -(-rows.n // self.lanes), rows.n, *given, *made)
 
     def _check_doubtful(self, rows: FaceRows, neighbors: cla.Array) -> int:
         """Return the error bits of doubtful cells in the graph (`rows.starts`, `neighbors`)."""
-        self.engine.run_each(
-            self._kernels.check_doubtful,
-            rows.n,
-            rows.places,
-            rows.counts,
-            rows.starts,
-            neighbors,
-            self.cells_of(rows.n)["volumes"],
-            rows.points,
-            *rows.corners,
-            rows.share,
-            rows.report,
-        )
+        graph = rows.places, rows.counts, rows.starts, neighbors, self.cells_of(rows.n)["volumes"]
+        given = *graph, *rows.sites, rows.share, rows.report
+        self.engine.run_each(self._kernels.check_doubtful, rows.n, *given)
         return self._read_report()[0] & ~DOUBT
 
     def _measure_without_loops(self, rows: FaceRows, neighbors: cla.Array) -> Tessellation | None:

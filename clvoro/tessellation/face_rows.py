@@ -43,6 +43,21 @@ class FaceRows:
     """Share of a cell that round-off may make uncertain."""
 
     @property
+    def output(self) -> tuple[object, ...]:
+        """What kernels write that make rows, as their arguments."""
+        return self.slots, self.counts, self.places
+
+    @property
+    def input(self) -> tuple[object, ...]:
+        """What kernels read of rows, as their arguments."""
+        return self.places, self.slots, self.counts, *self.old
+
+    @property
+    def sites(self) -> tuple[object, ...]:
+        """Generators and box, as arguments of kernels."""
+        return self.points, *self.corners
+
+    @property
     def n(self) -> int:
         """Number of rows."""
         return len(self.places)

@@ -87,21 +87,9 @@ class SolidBox(ClipBox):
         Nothing is read. Where there is no room, cells are flagged as those of which the surface is not known.
         """
         self._counters.fill(0)
-        self.engine.run_each(
-            self._kernels.find_own_planes,
-            self._n,
-            points,
-            *self._walls,
-            *self._tree,
-            self._normals,
-            self._reach,
-            np.int32(len(self._labels)),
-            self._rows,
-            self._labels,
-            self._planes,
-            self._found,
-            self._counters,
-        )
+        walls = *self._walls, *self._tree, self._normals, self._reach
+        found = np.int32(len(self._labels)), self._rows, self._labels, self._planes, self._found, self._counters
+        self.engine.run_each(self._kernels.find_own_planes, self._n, points, *walls, *found)
 
     def _grow(self) -> bool:
         """Make room for all planes that were found; return whether there was too little."""

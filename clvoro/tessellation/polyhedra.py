@@ -210,22 +210,12 @@ class Polyhedra(CellBuilder):
         engine, rows = self.engine, len(cut.counts)
         assert self._walks is not None
         with engine.workspace.frame():
-            engine.run_each(
-                self._walks.walk_all_cells,
-                -(-rows // STRETCH),
-                np.int32(rows),
-                self._ordered(binned, rows),
-                binned.points,
-                binned.items,
-                binned.spacing,
-                *binned.search,
-                *box.clip_args(engine),
-                engine.real.type(FIRST_REACH),
-                np.int32(len(cut.labels)),
-                *cut.output(self._report),
-                *halo_args,
-                group=1,
-            )
+            bins = binned.points, binned.items, binned.spacing, *binned.search
+            items, reach = -(-rows // STRETCH), engine.real.type(FIRST_REACH)
+            made = np.int32(len(cut.labels)), *cut.output(self._report), *halo_args
+            walk = self._walks.walk_all_cells
+            given = self._ordered(binned, rows), *bins, *box.clip_args(engine), reach
+            engine.run_each(walk, items, np.int32(rows), *given, *made, group=1)
 
     def _clip(
         self,
@@ -302,14 +292,11 @@ class Polyhedra(CellBuilder):
         # The previous graph stays valid until the end.
         starts, kept = engine.scratch(rows + 1, np.int32), engine.scratch(cut.m, np.uint8)
         args = engine.period_args
+        faces = cut.places, cut.counts, cut.labels, cut.measures, cut.cells["volumes"]
         engine.run_each(
             k.match_polyhedron_faces,
             rows,
-            cut.places,
-            cut.counts,
-            cut.labels,
-            cut.measures,
-            cut.cells["volumes"],
+            *faces,
             points,
             share,
             kept,
@@ -333,37 +320,13 @@ class Polyhedra(CellBuilder):
         vertices = self._vertices(int(room)) if with_corners else ()
         with engine.workspace.frame():
             neighbors = engine.scratch(min(cut.m, int(room)), np.int32)
-            engine.run_each(
-                k.place_faces,
-                rows,
-                cut.places,
-                cut.counts,
-                cut.labels,
-                cut.measures,
-                cut.centroids,
-                matching.kept,
-                report,
-                room,
-                starts,
-                neighbors,
-                faces["face_measures"],
-                faces["face_centroids"],
-            )
-            engine.run_each(
-                k.put_rows,
-                rows,
-                cut.places,
-                cut.counts,
-                report,
-                room,
-                starts,
-                neighbors,
-                np.int32(with_corners),
-                *((cut.corners, cut.keys) if with_corners else (report, report)),
-                of_rows,
-                faces["neighbors"],
-                *(vertices or (report, report)),
-            )
+            rows_of_faces = cut.places, cut.counts, cut.labels, cut.measures, cut.centroids, matching.kept
+            made = neighbors, faces["face_measures"], faces["face_centroids"]
+            engine.run_each(k.place_faces, rows, *rows_of_faces, report, room, starts, *made)
+            corners = (cut.corners, cut.keys) if with_corners else (report, report)
+            made = of_rows, faces["neighbors"], *(vertices or (report, report))
+            given = cut.places, cut.counts, report, room, starts, neighbors, np.int32(with_corners), *corners
+            engine.run_each(k.put_rows, rows, *given, *made)
         matching.arrays = {"starts": of_rows, **faces, "vertices": vertices}
 
     def _ordered(self, binned: BinnedPoints, rows: int) -> cla.Array:

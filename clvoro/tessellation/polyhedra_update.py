@@ -172,33 +172,17 @@ class _Rounds:
         """Check changed cells, and count those that must be updated again, and the unfinished ones."""
         engine, k, cut = self._engine, self._kernels, self.cut
         room = np.int32(self.room)
-        engine.run_each(
-            k.check_cells,
-            self._n,
-            room,
-            self._report,
-            cut.places,
-            cut.counts,
-            cut.labels,
-            cut.measures,
-            cut.corners,
-            cut.keys,
-            self._changed,
-            self._marks,
-        )
+        faces = cut.places, cut.counts, cut.labels, cut.measures, cut.corners, cut.keys
+        engine.run_each(k.check_cells, self._n, room, self._report, *faces, self._changed, self._marks)
 
     def list_marked(self, number: int, most: int) -> None:
         """List the marked cells, if they are not more than `most`. The report has room for the first rounds."""
+        marks = self._more, self.cut.counts, self._marks, self._changed, self._listed, self._further
         self._engine.run_each(
             self._kernels.list_marked_cells,
             self._n,
             np.int32(most),
             np.int32(min(number, MAX_ROUNDS - 1)),
-            self._more,
-            self.cut.counts,
-            self._marks,
-            self._changed,
-            self._listed,
-            self._further,
+            *marks,
             self._report,
         )

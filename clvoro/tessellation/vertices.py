@@ -55,15 +55,6 @@ class VertexNumbering:
                 "on a common circle"
             )
         cell_vertices, positions = engine.empty(m, np.int32), engine.empty((count, engine.dim))
-        engine.run_each(
-            k.place_polygon_vertices,
-            t.n,
-            t.sites,
-            *box.device_corners(engine.real),
-            *t.graph,
-            owners,
-            ids,
-            cell_vertices,
-            positions,
-        )
+        made = owners, ids, cell_vertices, positions
+        engine.run_each(k.place_polygon_vertices, t.n, t.sites, *box.device_corners(engine.real), *t.graph, *made)
         return Vertices(count, positions, cell_vertices)

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from clvoro.adaptation.insertion_deletion import CellSizes, Change, Generators, InsertionDeletion
+from clvoro.adaptation.insertion_deletion import CellSizes, Change, Generators, InsertionDeletion, Present
 from clvoro.adaptation.tuning import (
     CLIMB_STRAIN,
     LOG_RATIO_RINGS,
@@ -64,16 +64,14 @@ class Sweep:
             engine.upload(self.ever_changed),
         )
         self.first_new = 5 * n
-        control = control or InsertionDeletion(engine)
+        control, fixed = control or InsertionDeletion(engine), options.pop("fixed", 0)
+        present = Present(self.box, self.t, rows, self.first_new, fixed)
         if "quality" in options:
             quality = engine.upload(options.pop("quality"))
-            self.new = control.repair_cells(self.box, self.t, quality, rows, self.first_new, **options)
+            self.new = control.repair_cells(present, quality, **options)
         else:
             sizes = CellSizes(*map(engine.upload, (self.h, local_length, self.log_ratio)))
-            fixed = options.pop("fixed", 0)
-            self.new = control.insert_delete(
-                self.box, self.t, sizes, rows, self.first_new, Change(total, **options), fixed
-            )
+            self.new = control.insert_delete(present, sizes, Change(total, **options))
         if self.new is not None:
             self.account()
 

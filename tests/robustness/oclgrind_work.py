@@ -21,7 +21,7 @@ import pyopencl as cl
 from scipy.spatial import ConvexHull
 
 import clvoro
-from clvoro.adaptation.insertion_deletion import CellSizes, Change, Generators, InsertionDeletion
+from clvoro.adaptation.insertion_deletion import CellSizes, Change, Generators, InsertionDeletion, Present
 from clvoro.adaptation.stages import Stages
 from clvoro.opencl import program as _program
 from clvoro.opencl.engine import Engine
@@ -434,11 +434,12 @@ def nuclei(adapter: clvoro.Adapter) -> None:
     )
     sizes, log_ratio = engine.upload(np.full(n, h)), engine.zeros(n)
     control = InsertionDeletion(engine)
-    found = control.insert_delete(PATCH, t, CellSizes(sizes, sizes, log_ratio), rows, n, Change(0.0, nuclei=2))
+    present = Present(PATCH, t, rows, n)
+    found = control.insert_delete(present, CellSizes(sizes, sizes, log_ratio), Change(0.0, nuclei=2))
     assert found is not None
     assert found.inserted + found.deleted >= 2
     quality = engine.upload(np.linspace(0.8, 1, n))
-    found = control.repair_cells(PATCH, t, quality, rows, n, deficit=0.1, split=True, share=0.5)
+    found = control.repair_cells(present, quality, deficit=0.1, split=True, share=0.5)
     assert found is not None
     assert found.inserted >= 1
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import scipy
 
-from clvoro.adaptation.insertion_deletion import CellSizes, Change, Generators
+from clvoro.adaptation.insertion_deletion import CellSizes, Change, Generators, Present
 from clvoro.adaptation.stages import Stages
 from clvoro.geometry.box import Box
 from clvoro.opencl.peers import ALONE
@@ -295,15 +295,10 @@ def test_insertion_and_deletion_in_two_halves(ctx, dim, real, climb, missing):
         given = halves.places[own], halves.labels[own], np.zeros((t.n, dim)), zeros, zeros
         types = None, np.int32, None, np.uint64, None
         with engine.workspace.frame():
-            return stages.insertion_deletion.insert_delete(
-                halves.box,
-                t,
-                CellSizes(*(engine.upload(v[own]) for v in values.values())),
-                Generators(*map(engine.upload, given, types)),
-                2 * halves.n,
-                Change(missing, nuclei=5, climb=climb and dim == 2),
-                fixed=40,
-            )
+            present = Present(halves.box, t, Generators(*map(engine.upload, given, types)), 2 * halves.n, fixed=40)
+            sizes = CellSizes(*(engine.upload(v[own]) for v in values.values()))
+            change = Change(missing, nuclei=5, climb=climb and dim == 2)
+            return stages.insertion_deletion.insert_delete(present, sizes, change)
 
     one, two = halves.run(work)
     assert one.inserted + one.deleted >= 4

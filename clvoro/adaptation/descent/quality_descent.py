@@ -74,39 +74,15 @@ class QualityDescent:
         with engine.workspace.frame():
             forces, rows = engine.scratch((t.rows, 4)), t.whole or t
             assert rows.n == t.rows, "rows of neighbors are read"
-            engine.run(
-                k.compute_cell_forces,
-                -(-t.n // 4),
-                np.int32(t.n),
-                t.starts,
-                t.face_measures,
-                t.volumes,
-                quality,
-                h,
-                real(quality_weight),
-                real(bad_cell_weight),
-                forces,
-            )
+            cells = t.starts, t.face_measures, t.volumes, quality, h
+            weights = real(quality_weight), real(bad_cell_weight)
+            engine.run(k.compute_cell_forces, -(-t.n // 4), np.int32(t.n), *cells, *weights, forces)
             t.forward(engine, forces)
-            engine.run_each(
-                k.descend_quality,
-                t.n,
-                *rows.graph,
-                rows.face_measures,
-                rows.face_centroids,
-                t.points,
-                forces,
-                real(rate),
-                real(max_displacement),
-                real(edges.length),
-                real(edges.stiffness),
-                real(pairs.length),
-                real(pairs.stiffness),
-                real(full_rate),
-                lloyd,
-                *t.outlines,
-                *engine.period_args,
-            )
+            faces = *rows.graph, rows.face_measures, rows.face_centroids
+            repulsions = edges.length, edges.stiffness, pairs.length, pairs.stiffness
+            limits = map(real, (rate, max_displacement, *repulsions, full_rate))
+            moved = lloyd, *t.outlines, *engine.period_args
+            engine.run_each(k.descend_quality, t.n, *faces, t.points, forces, *limits, *moved)
 
     def open_triangles(self, t: Tessellation, displacement: cla.Array) -> int:
         """Write the displacement (n, d) that opens obtuse Delaunay triangles; return their number.

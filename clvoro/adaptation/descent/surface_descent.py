@@ -37,29 +37,9 @@ class SurfaceDescent:
         engine, k, real = self.engine, self._kernels, self.engine.real.type
         with engine.workspace.frame():
             forces = engine.scratch((t.rows, 2))
-            engine.run_each(
-                k.compute_surface_forces,
-                t.n,
-                t.starts,
-                t.face_measures,
-                t.volumes,
-                quality,
-                real(bad_cell_weight),
-                forces,
-            )
+            cells = t.starts, t.face_measures, t.volumes, quality
+            engine.run_each(k.compute_surface_forces, t.n, *cells, real(bad_cell_weight), forces)
             t.forward(engine, forces)
-            engine.run_each(
-                k.descend_surface,
-                t.n,
-                *t.graph,
-                t.face_measures,
-                t.face_centroids,
-                t.vertices[0],
-                t.points,
-                h,
-                forces,
-                real(rate),
-                real(max_displacement),
-                lloyd,
-                *engine.period_args,
-            )
+            faces = *t.graph, t.face_measures, t.face_centroids, t.vertices[0]
+            limits = real(rate), real(max_displacement)
+            engine.run_each(k.descend_surface, t.n, *faces, t.points, h, forces, *limits, lloyd, *engine.period_args)

@@ -104,25 +104,16 @@ class Mmpde:
         """
         c, real = connections, self.engine.real.type
         energy, power, flat = (self.engine.scratch(mesh.n) for _ in range(3))
+        simplices = c.starts, c.vertices, c.owners, c.codes, c.reference
+        state = mesh.points, mesh.h, gradient, mesh.velocity, real(RATE)
+        results = descent, energy, power, flat, room
         self.engine.run_each(
             self._kernels.descend_functional,
             mesh.n,
-            c.starts,
-            c.vertices,
-            c.owners,
-            c.codes,
-            c.reference,
-            mesh.points,
-            mesh.h,
-            gradient,
-            mesh.velocity,
-            real(RATE),
+            *simplices,
+            *state,
             *mesh.domain.device_args(self.engine),
-            descent,
-            energy,
-            power,
-            flat,
-            room,
+            *results,
         )
         self._summaries.collect_all({"energy": energy, "power": power, "flat": flat}, mesh.n)
         found = self._summaries.read()
@@ -131,17 +122,8 @@ class Mmpde:
     def bound_displacement(self, mesh: MeshState, descent: cla.Array, share: float, room: cla.Array) -> None:
         """Add `share` of the last displacement to `descent` (n, d), and bound its length."""
         real = self.engine.real.type
-        self.engine.run_each(
-            self._kernels.bound_displacement,
-            mesh.n,
-            mesh.velocity,
-            real(share),
-            real(LONGEST),
-            real(ROOM),
-            mesh.local_length,
-            room,
-            descent,
-        )
+        limits = real(share), real(LONGEST), real(ROOM), mesh.local_length, room
+        self.engine.run_each(self._kernels.bound_displacement, mesh.n, mesh.velocity, *limits, descent)
 
 
 @dataclass

@@ -116,7 +116,7 @@ class CutCoverage(FullCoverage):
 
     def contains(self, points: np.ndarray) -> np.ndarray:
         """Return for each of `points` (n, d) in the boxes whether it is inside the domain, (n,) bool."""
-        return self.domain.contains(points)
+        return self.domain.covers(points)
 
     def _nearer(self, x: np.ndarray, box: np.ndarray, cut: np.ndarray, attempt: int) -> None:
         """Move those points of `x` (n, d) in `cut` boxes towards the inner points, after many attempts."""
@@ -232,10 +232,6 @@ class SolidCoverage(CutCoverage):
         points[cut] = np.where(out[:, :, None], self.inner[chosen][cut][:, None, :], points[cut])
         return points
 
-    def contains(self, points: np.ndarray) -> np.ndarray:
-        """Return for each of `points` (n, 3) in the boxes whether it is inside the domain, (n,) bool."""
-        return self.domain.covers(points)
-
     def draw(self, at: np.ndarray, box: np.ndarray, attempt: int) -> np.ndarray:
         """Return the points at relative positions `at` (n, d) in [0, 1] in the boxes `box` (n,).
 
@@ -289,10 +285,6 @@ class PolygonCoverage(CutCoverage):
         share[lost] = 0.0
         parts[(share == 0) | (share == 1)] = None
         self.share[rows], self.inner[rows], self._parts[rows] = share, inner, parts
-
-    def contains(self, points: np.ndarray) -> np.ndarray:
-        """Return for each of `points` (n, 2) in the boxes whether it is inside the domain, (n,) bool."""
-        return self.domain.covers(points)
 
     def draw(self, at: np.ndarray, box: np.ndarray, attempt: int) -> np.ndarray:
         """Return the points at relative positions `at` (n, 2) in [0, 1] in the boxes `box` (n,).

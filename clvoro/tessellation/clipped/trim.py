@@ -91,32 +91,15 @@ class Trim:
         )
         self._flags.fill(0)
         if engine.traits.site_values:
-            engine.run_each(
-                k.find_outside,
-                n,
-                *convex.graph,
-                convex.sites,
-                *chords.arrays[:2],
-                np.int32(len(chords.tangents)),
-                chords.slots,
-                convex.volumes,
-                convex.offsets,
-            )
+            edges = *chords.arrays[:2], np.int32(len(chords.tangents)), chords.slots
+            engine.run_each(k.find_outside, n, *convex.graph, convex.sites, *edges, convex.volumes, convex.offsets)
         loops = room("loops", size=places, dtype=np.int32)
         pieces = room("pieces", size=places, dtype=np.int32)
         roots = room("roots", size=places, dtype=np.int32)
         starts = room("segment_starts", size=u + 1, dtype=np.int32)
-        engine.run_each(
-            k.find_loops,
-            u,
-            *cells,
-            room("chord_loops", size=chords.count, dtype=np.int32),
-            loops,
-            pieces,
-            roots,
-            starts,
-            self._flags,
-        )
+        chord_loops = room("chord_loops", size=chords.count, dtype=np.int32)
+        walked = loops, pieces, roots, starts, self._flags
+        engine.run_each(k.find_loops, u, *cells, chord_loops, *walked)
         self._scan.exclusive(starts, starts, u, total=(self._flags, 1))
         flags, count = self._flags.get().tolist()
         self._demand(flags)
@@ -205,20 +188,10 @@ class Trim:
         self, convex: Tessellation, chords: Chords, found: _Pieces, rows: tuple[cla.Array, ...], outlines: cla.Array
     ) -> None:
         """Copy the cells that the boundary does not cross."""
-        self.engine.run_each(
-            self._kernels.copy_whole,
-            len(found.marks),
-            *convex.graph,
-            convex.face_measures,
-            convex.face_centroids,
-            *found.segments,
-            chords.slots,
-            found.roots,
-            found.marks,
-            *rows,
-            convex.volumes,
-            outlines,
-        )
+        faces = *convex.graph, convex.face_measures, convex.face_centroids
+        owners = chords.slots, found.roots, found.marks
+        written = *rows, convex.volumes, outlines
+        self.engine.run_each(self._kernels.copy_whole, len(found.marks), *faces, *found.segments, *owners, *written)
 
     def _write_trimmed(
         self,
@@ -237,24 +210,7 @@ class Trim:
         lists = chords.list_starts, chords.listed, found.roots
         engine.run_each(k.name_chord_owners, u, *found.segments, *lists, place_cells, chord_owners)
         orphans, orphan_count = found.orphans
-        engine.run_each(
-            k.write_trimmed,
-            u,
-            int(straight),
-            *found.segments,
-            *chords.arrays,
-            chord_owners,
-            *chords.turns,
-            points,
-            chords.touched,
-            chords.slots,
-            found.roots,
-            orphans,
-            np.int32(orphan_count),
-            place_cells,
-            *rows,
-            convex.volumes,
-            convex.offsets,
-            convex.covariances,
-            outlines,
-        )
+        boundary = *found.segments, *chords.arrays, chord_owners, *chords.turns
+        places = points, chords.touched, chords.slots, found.roots, orphans, np.int32(orphan_count), place_cells
+        moments = convex.volumes, convex.offsets, convex.covariances
+        engine.run_each(k.write_trimmed, u, int(straight), *boundary, *places, *rows, *moments, outlines)

@@ -93,20 +93,9 @@ class GhostImages:
         halo.kept = np.float32(0 if halo.is_bound else (KEPT_ESTIMATE if others or halo.estimated else KEPT)[d])
         halo.is_bound = False
         halo.extremes.fill(0)
-        engine.run_each(
-            k.predict_halo_depths,
-            block_count(d),
-            halo.required,
-            was,
-            np.float32(factor),
-            np.int32(others),
-            np.int32(grow),
-            *blocks,
-            halo.depths,
-            halo.extremes,
-            halo.requests,
-            *engine.period_args,
-        )
+        changes = halo.required, was, np.float32(factor), np.int32(others), np.int32(grow)
+        depths = halo.depths, halo.extremes, halo.requests
+        engine.run_each(k.predict_halo_depths, block_count(d), *changes, *blocks, *depths, *engine.period_args)
         self._report.set(np.array([0, 0, 2**31 - 1], np.int32))
         firsts = self._room("firsts", size=n + 1, dtype=np.int32)
         engine.run_each(k.count_images, n, points, halo.depths, halo.extremes, *blocks, firsts, *engine.period_args)
@@ -116,19 +105,9 @@ class GhostImages:
         extended = self._room("points", size=engine.site_size * count).reshape(-1, engine.site_size)
         owners = self._room("owners", size=ghosts, dtype=np.int32)
         codes = self._room("image codes", size=ghosts, dtype=np.int32)
-        engine.run_each(
-            k.place_images,
-            n,
-            points,
-            halo.depths,
-            halo.extremes,
-            *blocks,
-            firsts,
-            extended,
-            owners,
-            codes,
-            *engine.period_args,
-        )
+        depths = halo.depths, halo.extremes
+        images = extended, owners, codes
+        engine.run_each(k.place_images, n, points, *depths, *blocks, firsts, *images, *engine.period_args)
         lower, upper = (corner[:d].astype(np.float64) for corner in corners)
         # Round up to a coarse grid, so that the corners of the extended box are exact.
         widest = np.ceil(halo.extremes.get().view(np.float32)[:d] * 2.0**20) / 2.0**20
@@ -156,16 +135,8 @@ class GhostImages:
         image. `codes` are those of its faces (see `Folded`). The array is in the workspace.
         """
         engine, scaled = self.engine, self.engine.scratch(len(t.neighbors), self.engine.face)
-        engine.run_each(
-            self._kernels.scale_far_measures,
-            t.n,
-            *t.graph,
-            codes,
-            t.face_measures,
-            t.sites,
-            scaled,
-            *engine.period_args,
-        )
+        faces = *t.graph, codes, t.face_measures, t.sites
+        engine.run_each(self._kernels.scale_far_measures, t.n, *faces, scaled, *engine.period_args)
         return scaled
 
     def unfold(self, part: Part, previous: Tessellation | NeighborRows) -> NeighborRows:
@@ -173,29 +144,19 @@ class GhostImages:
         n, ghosts = part.n_own, _ghosts(part)
         m = int(previous.starts[n].get())
         neighbors = self._room("unfolded", size=m, dtype=np.int32)
-        self.engine.run_each(
-            self._kernels.unfold_rows,
-            n,
-            *previous.graph,
-            part.points,
-            ghosts.firsts,
-            ghosts.codes,
-            neighbors,
-            *self.engine.period_args,
-        )
+        rows = *previous.graph, part.points, ghosts.firsts, ghosts.codes
+        self.engine.run_each(self._kernels.unfold_rows, n, *rows, neighbors, *self.engine.period_args)
         return NeighborRows(n, previous.starts, neighbors)
 
     def fold_clipped(self, part: Part, cut: CutCells, report: cla.Array, used: int) -> None:
         """Replace images by their owners in cells that were clipped in an update, in 3D: those behind `used` faces."""
+        cells = cut.places, cut.counts, part.points, _ghosts(part).rows
         self.engine.run_each(
             self._kernels.fold_clipped_cells,
             part.n_own,
             np.int32(used),
             np.int32(cut.m),
-            cut.places,
-            cut.counts,
-            part.points,
-            _ghosts(part).rows,
+            *cells,
             self._report,
             cut.labels,
             report,
@@ -265,23 +226,17 @@ class GhostImages:
         neighbors, codes = (room(name, self._turn, size=m, dtype=np.int32) for name in ("neighbors", "codes"))
         kept = room("kept", size=m, dtype=np.uint8)
         counts = room("starts", self._turn, size=n + 1, dtype=np.int32)
+        faces = *t.graph, t.face_measures, t.volumes, t.points
+        images = ghosts.firsts, ghosts.rows, ghosts.codes
+        folded = neighbors, codes, kept, counts, self._report
         engine.run_each(
             self._kernels.fold_rows,
             n,
-            *t.graph,
-            t.face_measures,
-            t.volumes,
-            t.points,
-            ghosts.firsts,
-            ghosts.rows,
-            ghosts.codes,
+            *faces,
+            *images,
             engine.real.type(share),
             np.int32(nearest),
-            neighbors,
-            codes,
-            kept,
-            counts,
-            self._report,
+            *folded,
             *engine.period_args,
         )
         return neighbors, codes, kept, counts

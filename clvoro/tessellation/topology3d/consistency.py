@@ -129,15 +129,12 @@ class FaceSharing:
         distances = engine.empty(c, np.uint32).fill(2**32 - 1)
         targets = engine.empty(c, np.int32).fill(_LARGEST)
         for second_pass in (0, 1):
+            loops = f.sharpness, f.loop_starts, f.loops, self.twins, self.differs
             engine.run_each(
                 k.find_targets,
                 self.h,
                 *self._vertices,
-                f.sharpness,
-                f.loop_starts,
-                f.loops,
-                self.twins,
-                self.differs,
+                *loops,
                 np.int32(doublings),
                 np.int32(second_pass),
                 distances,

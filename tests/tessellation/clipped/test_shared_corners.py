@@ -5,7 +5,7 @@ import pytest
 import shapely
 
 import clvoro
-from clvoro.adaptation.insertion_deletion import CellSizes, Change, Generators, InsertionDeletion
+from clvoro.adaptation.insertion_deletion import CellSizes, Change, Generators, InsertionDeletion, Present
 from clvoro.adaptation.stages import Stages
 from clvoro.solvers.components import connected_components
 from clvoro.tessellation.tessellator import Tessellator
@@ -82,7 +82,7 @@ def reorganized(engine, domain, t, total):
         engine.zeros(t.n),
     )
     sizes = CellSizes(one, one, engine.zeros(t.n))
-    return InsertionDeletion(engine).insert_delete(domain, t, sizes, rows, t.n, Change(total, climb=False))
+    return InsertionDeletion(engine).insert_delete(Present(domain, t, rows, t.n), sizes, Change(total, climb=False))
 
 
 def test_components_follow_from_the_graph_not_from_positions(ctx):
