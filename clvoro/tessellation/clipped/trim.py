@@ -41,6 +41,8 @@ class Trimmed:
 class _Pieces:
     """The pieces into which the boundary cuts convex cells, on the device."""
 
+    convex: Tessellation
+    chords: Chords
     segments: tuple[cla.Array, ...]
     """SEGMENT_ARGS of kernels."""
     segment_count: int
@@ -80,15 +82,8 @@ class Trim:
         """
         engine, k, room = self.engine, self._kernels, self._room
         u, places = chords.touched_count, chords.count + chords.touched_count
-        cells = (
-            *convex.graph,
-            convex.sites,
-            *domain.device_corners(engine.real),
-            chords.touched,
-            chords.list_starts,
-            chords.listed,
-            *chords.arrays,
-        )
+        lists = chords.touched, chords.list_starts, chords.listed, *chords.arrays
+        cells = *convex.graph, convex.sites, *domain.device_corners(engine.real), *lists
         self._flags.fill(0)
         if engine.traits.site_values:
             edges = *chords.arrays[:2], np.int32(len(chords.tangents)), chords.slots
@@ -103,20 +98,18 @@ class Trim:
         self._scan.exclusive(starts, starts, u, total=(self._flags, 1))
         flags, count = self._flags.get().tolist()
         self._demand(flags)
-        names = ("labels", "from", "to", "places")
-        parts = [room(name, size=count, dtype=np.int32) for name in names]
+        parts = [room(name, size=count, dtype=np.int32) for name in ("labels", "from", "to", "places")]
         parts += [room(name, size=2 * count) for name in ("p", "q")]
         engine.run_each(k.write_segments, u, *cells, loops, pieces, starts, *parts)
         segments = (starts, *parts)
-        engine.run_each(
-            k.check_segments, u, np.int32(n), *segments, chords.touched, chords.slots, roots, *convex.graph, self._flags
-        )
+        owners = chords.touched, chords.slots, roots
+        engine.run_each(k.check_segments, u, np.int32(n), *segments, *owners, *convex.graph, self._flags)
         self._demand(int(read_number(self._flags, 0)))
         marks = room.zeros("marks", size=n, dtype=np.int32)
-        found = _Pieces(segments, count, pieces, roots, marks, (pieces, 0))
+        found = _Pieces(convex, chords, segments, count, pieces, roots, marks, (pieces, 0))
         if flags & ORPHANS:
-            found = replace(found, orphans=self._adopt(chords, found))
-        return self._write(points, convex, chords, found, straight)
+            found = replace(found, orphans=self._adopt(found))
+        return self._write(found, points, straight)
 
     @staticmethod
     def _demand(flags: int) -> None:
@@ -124,10 +117,10 @@ class Trim:
         if flags & LOST:
             raise BoundaryError
 
-    def _adopt(self, chords: Chords, found: _Pieces) -> tuple[cla.Array, int]:
+    def _adopt(self, found: _Pieces) -> tuple[cla.Array, int]:
         """Find the owner of each piece without generator; return the pieces that change cells, and their number."""
-        engine, k, room, u = self.engine, self._kernels, self._room, chords.touched_count
-        pieces, roots = found.loop_pieces, found.roots
+        engine, k, room, chords = self.engine, self._kernels, self._room, found.chords
+        pieces, roots, u = found.loop_pieces, found.roots, chords.touched_count
         places = chords.count + u
         orphans = room("orphans", size=places + 1, dtype=np.int32)
         other = room("other_roots", size=places, dtype=np.int32)
@@ -141,21 +134,21 @@ class Trim:
         engine.run_each(k.list_orphans, places, ranks, orphans)
         return orphans, int(read_number(ranks, places))
 
-    def _write(
-        self, points: cla.Array, convex: Tessellation, chords: Chords, found: _Pieces, straight: bool
-    ) -> Tessellation:
-        """Write the rows and measures of the diagram."""
-        room, n = self._room, len(found.marks)
+    def _write(self, found: _Pieces, points: cla.Array, straight: bool) -> Tessellation:
+        """Write the rows and measures of the diagram: copy the cells that the boundary does not cross."""
+        room, n, convex, chords = self._room, len(found.marks), found.convex, found.chords
         # Every face of the diagram is a face of a convex cell or a segment.
         m = 7 * n + 8 + found.segment_count
-        starts = self._count(convex, chords, found)
+        starts = self._count(found)
         neighbors = room("neighbors", size=m, dtype=np.int32)
         measures, centroids = room("measures", size=m), room("centroids", size=2 * m)
         face_segments = room("face_segments", size=m, dtype=np.int32)
         outlines = room("outlines", size=2 * n)
         rows = starts, neighbors, measures, centroids
-        self._write_whole(convex, chords, found, rows, outlines)
-        self._write_trimmed(points, convex, chords, found, (*rows, face_segments), outlines, straight)
+        faces = *convex.graph, convex.face_measures, convex.face_centroids
+        owners, written = (chords.slots, found.roots, found.marks), (*rows, convex.volumes, outlines)
+        self.engine.run_each(self._kernels.copy_whole, n, *faces, *found.segments, *owners, *written)
+        self._write_trimmed(found, points, (*rows, face_segments), outlines, straight)
         if convex.reach is not None:
             limit = self._kernels.limit_reach
             self.engine.run_each(limit, chords.touched_count, *found.segments, chords.touched, convex.reach)
@@ -174,37 +167,22 @@ class Trim:
             trimmed=Trimmed(convex, chords, found.segments, face_segments, found.segment_count),
         )
 
-    def _count(self, convex: Tessellation, chords: Chords, found: _Pieces) -> cla.Array:
+    def _count(self, found: _Pieces) -> cla.Array:
         """Return where the row of each cell starts."""
-        engine, k, n = self.engine, self._kernels, len(found.marks)
+        engine, k, n, chords = self.engine, self._kernels, len(found.marks), found.chords
         starts = self._room("starts", size=n + 1, dtype=np.int32)
-        engine.run_each(k.count_whole, n, convex.starts, chords.slots, starts)
+        engine.run_each(k.count_whole, n, found.convex.starts, chords.slots, starts)
         owners = chords.touched, chords.slots, found.roots
         engine.run_each(k.count_trimmed, chords.touched_count, *found.segments, *owners, starts)
         self._scan.exclusive(starts, starts, n)
         return starts
 
-    def _write_whole(
-        self, convex: Tessellation, chords: Chords, found: _Pieces, rows: tuple[cla.Array, ...], outlines: cla.Array
-    ) -> None:
-        """Copy the cells that the boundary does not cross."""
-        faces = *convex.graph, convex.face_measures, convex.face_centroids
-        owners = chords.slots, found.roots, found.marks
-        written = *rows, convex.volumes, outlines
-        self.engine.run_each(self._kernels.copy_whole, len(found.marks), *faces, *found.segments, *owners, *written)
-
     def _write_trimmed(
-        self,
-        points: cla.Array,
-        convex: Tessellation,
-        chords: Chords,
-        found: _Pieces,
-        rows: tuple[cla.Array, ...],
-        outlines: cla.Array,
-        straight: bool,
+        self, found: _Pieces, points: cla.Array, rows: tuple[cla.Array, ...], outlines: cla.Array, straight: bool
     ) -> None:
         """Write the cells that the boundary crosses."""
-        engine, k, room, u = self.engine, self._kernels, self._room, chords.touched_count
+        engine, k, room, convex, chords = self.engine, self._kernels, self._room, found.convex, found.chords
+        u = chords.touched_count
         place_cells = room("place_cells", size=chords.count + u, dtype=np.int32)
         chord_owners = room("chord_owners", size=chords.count, dtype=np.int32)
         lists = chords.list_starts, chords.listed, found.roots
