@@ -6,15 +6,17 @@
 For each number of ranks the script starts itself under `mpiexec`; with PoCL each rank has one core. `bits` says whether
 the diagram of random points has the same bits as with the first number of ranks. The other columns are of a run in a
 box, on a sphere, or in a lake, with sizes from h to 3 h, after a run of fewer cells, which builds kernels. `CPU s` is
-its processor time, summed over ranks, and `over one` the ratio to that of the first number of ranks. `floor` is the
-same ratio for as many processes at the same time that each make a mesh of n / p cells without messages: it has the cost
-of the fixed work of a step, and of shared cores and caches. `exchanges` and `reductions` are the rounds of messages
+the processor time of its work, summed over ranks, and `over one` the ratio to that of the first number of ranks.
+`waiting` is the processor time of waits for other ranks, which ask and sleep by turns; ranks with a core of their own
+wait less. `reading` is that of reading the cells afterwards. `floor` is the ratio for as many processes at the same
+time that each make a mesh of n / p cells without messages: it has the cost of the fixed work of a step, and of shared
+cores and caches. `exchanges` and `reductions` are the rounds of messages
 between pairs of ranks, and of sums over all ranks, per step in which all ranks work. Some of both take place at the
 same time; `waits` counts how often a rank waits for others. `ghosts` is the number of ghosts of rank 0 in the last
 diagram over 2 d (n / p)^((d - 1) / d), an estimate of one layer of cells around a part. `one round` is the share of
-diagrams whose cells were made once, since no ghosts were missing, and `asked` how often ranks asked each other for
-ghosts, over the number of diagrams. `memory` is the largest device memory of a rank, in the run and while its cells
-are read, over that of the first number of ranks. Needs `pip install -e '.[mpi]'`.
+diagrams whose cells were made once, since no ghosts were missing, and `asked` how often ranks asked each other for all
+ghosts anew, over the number of diagrams. `memory` is the largest device memory of a rank, in the run and while its
+cells are read, over that of the first number of ranks. Needs `pip install -e '.[mpi]'`.
 """
 
 from __future__ import annotations
@@ -26,6 +28,7 @@ import json
 import os
 import sys
 import time
+from collections.abc import Callable
 
 import numpy as np
 from _common import Report, counts, parser, run_ranks, shown
@@ -34,6 +37,7 @@ from _kinds import COAST
 import clvoro
 from clvoro.adaptation.run import Run
 from clvoro.opencl import memory_limits
+from clvoro.opencl.peers import Ranks
 from clvoro.tessellation.part_steps import PartSteps
 
 COLUMNS = {
@@ -41,8 +45,9 @@ COLUMNS = {
     "cells": shown("cells", ",d"),
     "bits": shown("bits", "s"),
     "mean e": shown("error", ".4f"),
-    "mean Q": shown("quality", ".4f"),
     "CPU s": shown("cpu", ".1f"),
+    "waiting": shown("waiting", ".1f"),
+    "reading": shown("reading", ".1f"),
     "over one": shown("over_one", ".2f"),
     "floor": shown("floor", ".2f"),
     "iterations": shown("iterations", ".1f"),
@@ -62,7 +67,8 @@ def measure_rank(options: argparse.Namespace) -> None:
 
     os.environ.setdefault(memory_limits.VARIABLE, "1024GiB")  # the memory is counted
     dim, cells, effort, comm = options.rank, options.cells, options.effort, MPI.COMM_WORLD
-    rounds, ghosts, asked, box = [], [0], [0], clvoro.Box((0,) * dim, (1,) * dim, periodic=options.periodic)
+    rounds, ghosts, asked, waited = [], [0], [0], [0.0]
+    box = clvoro.Box((0,) * dim, (1,) * dim, periodic=options.periodic)
     domain = clvoro.Sphere(0.5) if options.sphere else COAST if options.polygon else box
     x, dim = np.random.default_rng(1).random((cells, dim)) - 0.5 * options.sphere, domain.cell_dim
     x = x[domain.contains(x)] if options.polygon else x
@@ -79,6 +85,16 @@ def measure_rank(options: argparse.Namespace) -> None:
             ghosts[0] = part.count - part.n_own
         return found
 
+    def timed(wait: Callable[..., object]) -> Callable[..., object]:
+        def waiting(*given: object) -> object:
+            began = time.thread_time()
+            answer = wait(*given)
+            waited[0] += time.thread_time() - began
+            return answer
+
+        return waiting
+
+    Ranks._complete, Ranks._await_call = timed(Ranks._complete), timed(Ranks._await_call)
     PartSteps._finished = noted
     add_row, calls = Run._add_row, []
 
@@ -94,13 +110,15 @@ def measure_rank(options: argparse.Namespace) -> None:
     factor = {2: 2 / 3, 3: (13 / 27) ** 0.5}[dim]
     h = factor * (domain.measure / cells) ** (1 / dim)
 
-    def run(by: clvoro.Adapter, h: float) -> tuple[clvoro.Result, float]:
+    def run(by: clvoro.Adapter, h: float) -> tuple[clvoro.Result, float, float]:
+        """Return the mesh, and processor time of work and of waits over all ranks."""
         comm.Barrier()
-        began = time.process_time()
+        began, waits = time.process_time(), waited[0]
         mesh = by.run(domain, lambda p: h * (1 + 2 * (p[:, 0] - domain.lower[0])), effort)
-        return mesh, comm.allreduce(time.process_time() - began)
+        waits = waited[0] - waits
+        return mesh, comm.allreduce(time.process_time() - began - waits), comm.allreduce(waits)
 
-    run(adapter, 4 * h)  # builds kernels
+    run(adapter, 2 * h)  # builds kernels
     single = clvoro.Adapter(adapter.ctx, options.dtype, comm=MPI.COMM_SELF)
     run(single, 4 * h)
     least = run(single, h * comm.size ** (1 / dim))[1]
@@ -110,27 +128,30 @@ def measure_rank(options: argparse.Namespace) -> None:
     del whole, single
     gc.collect()
     memory_limits.MOST_TAKEN.clear()
-    mesh, spent = run(adapter, h)
+    mesh, spent, waits = run(adapter, h)
+    began = time.process_time()
     _ = mesh.diagram.vertices
+    reading = comm.allreduce(time.process_time() - began)
     taken = comm.allreduce(max(memory_limits.MOST_TAKEN.values()), MPI.MAX)
     steps = int(mesh.history["step"][-1])
     per_part = mesh.history["cells"][-1] / comm.size
     layer = 2 * dim * per_part ** ((dim - 1) / dim)
     if comm.rank == 0:
         last, together = mesh.history[-1], np.array([row[1:] for row in calls if row[0]])
-        done, exchanges, reductions, waits = together[-1] - together[0]
+        done, exchanges, reductions, halts = together[-1] - together[0]
         figures = {
             "ranks": comm.size,
             "cells": int(last["cells"]),
             "digest": digest.hexdigest(),
             "error": float(last["mean_error"]),
-            "quality": float(last["mean_quality"]),
             "cpu": spent,
+            "waiting": waits,
+            "reading": reading,
             "least": least,
             "iterations": float(mesh.history["iterations"].sum() / steps),
             "exchanges": exchanges / done,
             "reductions": reductions / done,
-            "waits": waits / done,
+            "waits": halts / done,
             "ghosts": ghosts[0] / layer,
             "one_round": float(np.mean(np.array(rounds) == 1)) if comm.size > 1 else 1.0,
             "taken": taken,

@@ -1,3 +1,4 @@
+#include "opencl/blocks.h"
 #include "opencl/real.h"
 
 /* A number from 1 to 2 for the face between the generators with labels a and b, whichever comes first. */
@@ -81,10 +82,10 @@ kernel void place_unfolded(const int size, global const REAL *points, const REAL
     }
 }
 
-/* sums[5 t ...] = the volumes of the generators t, t + size, ... of n; the weighted measures of their faces with
-   ghosts, positive in the cell of the lower label; those without signs; how many of these generators are beyond their
-   limits; and how many neighbors are half a period away or farther. Over all parts the second sum is zero if each face
-   has both sides. One work-item per t.
+/* sums[6 t ...] = the volumes of a share of the n generators; the weighted measures of their faces with ghosts,
+   positive in the cell of the lower label; those without signs; how many of these generators have too small a ball; how
+   many have moved too far; and how many neighbors are half a period away or farther. Over all parts the second sum is
+   zero if each face has both sides. One work-item per t; `size` is a multiple of GROUP_SIZE.
 
    needed[i] is the radius above. When generator i was at at[i], its part knew all generators within limits[i].s0 of it,
    and it was at least limits[i].s1 away from the balls of other parts that do not know it. */
@@ -96,8 +97,9 @@ kernel void sum_cells(const int size, const int n, const int rows, global const 
                       global REAL *sums)
 {
     WORK_ITEM(t);
-    REAL volume = 0, signed_sum = 0, sum = 0, beyond = 0, far = 0;
-    for (int i = t; i < n; i += size) {
+    const bool folds = fmax(periods.s0, fmax(periods.s1, periods.s2)) > 0;
+    REAL volume = 0, signed_sum = 0, sum = 0, small = 0, beyond = 0, far = 0;
+    for (LOOP_OF_ITEM(i, n, t / GROUP_SIZE, size / GROUP_SIZE, t % GROUP_SIZE)) {
         REAL moved2 = 0;
         for (int a = 0; a < DIM; ++a) {
             const REAL d = points[DIM * i + a] - at[DIM * i + a];
@@ -107,11 +109,12 @@ kernel void sum_cells(const int size, const int n, const int rows, global const 
         const REAL radius =
             certified_radius(i, n, rows, with_ghosts, factor, convex_starts, convex_neighbors, reach, points);
         needed[i] = (float)(radius * (1 + R(1e-6)));
-        beyond += !(radius + moved <= limits[i].s0 && moved <= limits[i].s1);
+        small += !(radius + moved <= limits[i].s0);
+        beyond += !(moved <= limits[i].s1);
         volume += volumes[i];
         for (int k = starts[i]; k < starts[i + 1]; ++k) {
             const int j = neighbors[k];
-            if (j >= 0)
+            if (folds && j >= 0)
                 far += is_far(points + DIM * i, points + DIM * j, periods);
             if (j < n)
                 continue;
@@ -120,11 +123,9 @@ kernel void sum_cells(const int size, const int n, const int rows, global const 
             sum += part;
         }
     }
-    sums[5 * t] = volume;
-    sums[5 * t + 1] = signed_sum;
-    sums[5 * t + 2] = sum;
-    sums[5 * t + 3] = beyond;
-    sums[5 * t + 4] = far;
+    const REAL all[6] = {volume, signed_sum, sum, small, beyond, far};
+    for (int k = 0; k < 6; ++k)
+        sums[6 * t + k] = all[k];
 }
 
 /* values[n + g] = values[rows[g]] for each ghost g. Rows of values have `words` 32-bit words of any type. A ghost

@@ -205,11 +205,12 @@ class Part:
           be known.
         - `periods` (4,) real: lengths of the periods; 0 between walls.
 
-        The result is (5,) ndarray: the volume of own cells; the signed sum of the measures of their faces with ghosts;
-        the sum without signs; the numbers of generators beyond their limits, and of neighbors half a period away or
-        farther. The signed sums of all parts add up to zero if each face between two parts has both sides.
+        The result is (6,) ndarray: the volume of own cells; the signed sum of the measures of their faces with ghosts;
+        the sum without signs; the numbers of generators whose ball is too small, of those that have moved too far, and
+        of neighbors half a period away or farther. The signed sums of all parts add up to zero if each face between two
+        parts has both sides.
         """
-        sums = engine.scratch((SUMS, 5))
+        sums = engine.scratch((SUMS, 6))
         given = *t.graph, self.labels, t.face_measures, t.volumes
         limited = np.int32(with_ghosts), engine.real.type(factor), t.reach, self.points, at, limits, needed, periods
         kernel = engine.kernels("tessellation/part", shared=True).sum_cells

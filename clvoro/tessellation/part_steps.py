@@ -7,9 +7,9 @@ radius contains the balls of all corners. So a cell is final if this part knows 
 Each part tells the others the boxes around its generators, and asks those whose boxes meet its balls for the generators
 inside. It asks for balls that are larger than necessary. So the ghosts are enough for some steps. When the cells are
 known, the room beyond the balls that they need is divided: balls become larger by a share of it, and the rest is a skin
-in which there is no unknown generator. The parts ask again only when a cell needs a larger ball, or when a generator
-has moved so far that it may be in a ball of a part that does not know it (`sum_cells` in part.cl). If there are new
-ghosts, all parts make their cells again.
+in which there is no unknown generator. If few cells need larger balls, parts ask only for those. They ask for all anew
+when that is not enough, or when a generator has moved so far that it may be in a ball of a part that does not know it
+(`sum_cells` in part.cl). If there are new ghosts, all parts make their cells again.
 """
 
 from __future__ import annotations
@@ -66,7 +66,10 @@ FILLED, MATCHED = {"float64": 1e-8, "float32": 1e-3}, {"float64": 1e-5, "float32
 relative difference between the measures of faces between parts, seen from both sides."""
 GROUP = 64
 """Number of balls in each group of the balls that another part has sent."""
-FAILED = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0])
+MENDED, WIDER = 256, 1.2
+"""Largest number of generators that get other limits without asking for all anew. Radius of their balls over the needed
+one."""
+FAILED = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0])
 """Summands of a part whose update has failed: zeros for those of `Part.sums`, 1 for the number of failed parts, and the
 attempt to trace the boundary of a polygon."""
 
@@ -96,7 +99,7 @@ class Chunks:
 
     Its attributes:
     - `order` (n,) int: generators chunk by chunk.
-    - `firsts` (k,) int: where the chunks begin.
+    - `firsts`, `sizes` (k,) int: where the chunks begin, and their numbers of generators.
     - `groups` (n,) int: the chunk of each generator.
     - `spacings` (n,) float: an estimate of the spacing around each generator. A run of `RUN` generators has the median
       of their distances from the nearest of the next `AHEAD`, in the order of chunks or of bins; the estimate is the
@@ -123,8 +126,17 @@ class Chunks:
         jumps = 1 + np.flatnonzero(np.linalg.norm(np.diff(x, axis=0), axis=1) > JUMP * usual[:-1])
         count = math.isqrt(n)
         self.firsts = np.unique(np.concatenate([np.arange(count) * n // count, jumps]))
+        self.sizes = np.diff(np.append(self.firsts, n))
         self.groups = np.empty(n, np.int32)
-        self.groups[self.order] = np.repeat(np.arange(len(self.firsts)), np.diff(np.append(self.firsts, n)))
+        self.groups[self.order] = np.repeat(np.arange(len(self.firsts)), self.sizes)
+
+    def rows(self, chosen: np.ndarray) -> np.ndarray:
+        """Return the generators of the `chosen` chunks, chunk by chunk."""
+        ends = np.cumsum(self.sizes[chosen])
+        if not len(ends):
+            return np.empty(0, int)
+        first = np.repeat(self.firsts[chosen] - ends + self.sizes[chosen], self.sizes[chosen])
+        return self.order[np.arange(ends[-1]) + first]
 
 
 class BallGroups:
@@ -147,20 +159,19 @@ class BallGroups:
 
     def facing(self, facts: np.ndarray) -> Facing:
         """Return how far these balls are from the boxes of another part, which has sent its `facts` (k, 2 d + 2)."""
-        boxes, largest, groups, dim = facts[:, :-2], facts[:, -2], self.chunks.groups, self.centers.shape[1]
+        boxes, largest, dim = facts[:, :-2], facts[:, -2], self.centers.shape[1]
         away = gaps(self.boxes, around(boxes))[:, 0]
         near = np.flatnonzero(away <= NEAR * np.maximum(self.largest, largest.max()))
         ways, limits = gaps(self.boxes[near], boxes), NEAR * np.maximum.outer(self.largest[near], largest)
         chosen, beside = np.nonzero(ways <= limits)
         away[near] = np.min(ways, axis=1, where=ways > limits, initial=FARTHEST)
         # Pairs of each ball in these groups with all boxes beside its group.
-        counts, firsts = np.zeros(len(away), int), np.zeros(len(away), int)
-        counts[near] = np.bincount(chosen, minlength=len(near))
-        firsts[near] = np.cumsum(counts[near]) - counts[near]
-        balls, away = np.flatnonzero(counts[groups]), away[groups]
+        counts = np.bincount(chosen, minlength=len(near))
+        begins, meet = np.cumsum(counts) - counts, np.flatnonzero(counts)
+        balls, sizes = self.chunks.rows(near[meet]), self.chunks.sizes[near[meet]]
         if not len(balls):
-            return Facing(facts, away, balls, balls, np.empty(0))
-        first, count = firsts[groups[balls]], counts[groups[balls]]
+            return Facing(facts, away, balls, np.empty(0), balls, balls, np.empty(0))
+        first, count = np.repeat(begins[meet], sizes), np.repeat(counts[meet], sizes)
         ends = np.cumsum(count)
         pairs = np.arange(ends[-1]) + np.repeat(first - ends + count, count)
         places, others, limits = np.repeat(balls, count), beside[pairs], limits[chosen, beside][pairs]
@@ -172,13 +183,13 @@ class BallGroups:
         ways = np.sqrt(ways2)
         close = ways <= limits
         apart = np.minimum.reduceat(np.where(close, FARTHEST, ways), ends - count)
-        away[balls] = np.minimum(away[balls], apart)
-        return Facing(facts, away, places[close], others[close], ways[close])
+        apart = np.minimum(apart, np.repeat(away[near[meet]], sizes))
+        return Facing(facts, away, balls, apart, places[close], others[close], ways[close])
 
     def meeting(self, facing: Facing) -> np.ndarray:
         """Return which balls, with their skins, meet a box in which the other part has generators, (m,) int."""
         found = facing.places[facing.ways <= (1 + SKIN) * self.radii[facing.places]]
-        return found[np.diff(found, prepend=-1) > 0]
+        return found[np.diff(found, prepend=-1) != 0]
 
 
 @dataclass(frozen=True)
@@ -186,14 +197,17 @@ class Facing:
     """The balls of a part that are near boxes of another part.
 
     - `facts` (m, 2 d + 2) float: facts about the groups of the other part; see `BallGroups`.
-    - `away` (n,) float: lower bound of the distance of each ball's center from the boxes with which it has no pairs.
-      This distance is also at least `NEAR` times the largest radius in such a box.
-    - `places`, `others`, `ways` (p,) int, int, float: pairs of a ball and a box in the order of balls, and the
+    - `away` (k,) float: lower bound of the distance of the centers of a group from the boxes with which it has no
+      pairs. This distance is also at least `NEAR` times the largest radius in such a box.
+    - `balls`, `apart` (b,) int, float: the balls of groups with pairs, and the same bound for each of them.
+    - `places`, `others`, `ways` (p,) int, int, float: pairs of a ball and a box in the order of `balls`, and the
       distances of the ball's center from this box.
     """
 
     facts: np.ndarray
     away: np.ndarray
+    balls: np.ndarray
+    apart: np.ndarray
     places: np.ndarray
     others: np.ndarray
     ways: np.ndarray
@@ -346,8 +360,6 @@ class PartSteps(DomainSteps):
         self._ghosts.fill(engine, n, points)
         if self.is_periodic:
             self._ghosts.shift(engine, n, self._periods, points)
-        if self._at is None:
-            self._note(points)
         return self._with_outside(Part(n, count, points, self.box, self._ghosts, labels=self._all_labels))
 
     @property
@@ -415,11 +427,11 @@ class PartSteps(DomainSteps):
         found = self.peers.exchange([labels[rows] for rows in sent])
         self._all_labels = engine.upload(np.concatenate([labels, *found]), np.int32)
 
-    def _note(self, points: cla.Array) -> None:
-        """Keep the positions of own generators, at which the limits hold, and upload the limits."""
-        engine, n = self.stages.engine, len(self._caps)
-        self._at = self._room("at", size=n * engine.dim).reshape(n, engine.dim)
-        cl.enqueue_copy(engine.queue, buffer_of(self._at), buffer_of(points), byte_count=self._at.nbytes)
+    def _send_limits(self, at: np.ndarray) -> None:
+        """Upload the limits of own generators, and the positions `at` (n, d) at which they hold."""
+        engine = self.stages.engine
+        self._at = self._room("at", size=at.size).reshape(at.shape)
+        engine.send(at.astype(engine.real), self._at)
         # Single precision must not round limits up.
         self._limits_there = engine.upload(self._limits * (1 - 1e-6), np.float32)
 
@@ -477,30 +489,29 @@ class PartSteps(DomainSteps):
                 return None if t is None else replace(t, part=part)
             needed = engine.scratch(n, np.float32)
             if t is not None:
-                assert self._at is not None
                 given = self._at, self._limits_there, 2 * (1 + NOISE[engine.real.name]), self._reads_rows, needed
                 attempt = 0 if self._cut is None else self._cut.attempt
                 sums = np.append(part.sums(engine, t, *given, self._periods), [0, attempt])
             sums = self.peers.total(sums)
-            if sums[5] or t is None:
+            if sums[6] or t is None:
                 # Ghost generators outside may be too near to cells that this part does not know.
                 self._labels = self._labels if self._cut is None else None
                 return None
-            if sums[3]:
+            if self._answers is not None and not sums[3] + sums[4]:
+                self._settle(self._answers, part, needed.get().astype(float))
+            elif sums[3] + sums[4] and not self._mend_limits(part, needed.get().astype(float), *sums[3:5]):
                 if not self._ask_again(part, needed.get().astype(float)):
                     return None
-            elif self._answers is not None:
-                self._settle(self._answers, part, needed.get().astype(float))
-            if not sums[6]:
+            if not sums[7]:
                 break
             # All parts trace the boundary at the same place.
             attempts = np.array(self.peers.gather(np.array(attempt)))
             attempt = int(attempts.max())
             if (attempts == attempt).all():
                 break
-        if sums[4]:
+        if sums[5]:
             raise FewCellsError(
-                f"{int(sums[4])} neighbors of generators are half a period away or farther, expected at least four or "
+                f"{int(sums[5])} neighbors of generators are half a period away or farther, expected at least four or "
                 f"five cells across each period of {self.domain}; use a smaller size, more cells (n_cells) or fewer "
                 "levels"
             )
@@ -533,6 +544,73 @@ class PartSteps(DomainSteps):
                 f"{abs(gap) / max(faces, 1e-300):.2g} of their area, expected none: ghosts are missing"
             )
 
+    def _mend_limits(self, part: Part, needed: np.ndarray, short: float, beyond: float) -> bool:
+        """Give other limits to the generators of all parts that are beyond theirs. Return whether all can have them.
+
+        The balls of `short` generators are too small for their `needed` (n,) radii; `beyond` generators have moved too
+        far.
+        """
+        if max(short, beyond) > MENDED or self._answers is not None:
+            return False
+        x, limits = part.points[: part.n_own].get().astype(float), self._limits
+        moves, share = np.linalg.norm(x - self._balls.centers, axis=1), 1 - 1e-5
+        far = np.flatnonzero(moves > share * limits[:, 1])
+        # Balls are compared with places where generators may be, so these are found first.
+        if beyond and not self._limit_anew(1, far, SKIN * self._caps[far], x, moves, needed + moves, SKIN / 4):
+            return False
+        moves[far] = 0
+        near = np.flatnonzero(needed + moves > share * limits[:, 0])
+        if short and not self._limit_anew(0, near, WIDER * needed[near], x, moves, moves, 1 / WIDER / share):
+            return False
+        self._send_limits(self._balls.centers)
+        return True
+
+    def _limit_anew(
+        self,
+        kind: int,
+        rows: np.ndarray,
+        wanted: np.ndarray,
+        x: np.ndarray,
+        moves: np.ndarray,
+        used: np.ndarray,
+        enough: float,
+    ) -> bool:
+        """Set the limits of one `kind` of own generators `rows` (k,), now at `x`, to at most those `wanted` (k,).
+
+        Limits of other parts' generators that do not know these, or are not known, become smaller, by at most half of
+        what is more than `used` (n,). Return whether all limits are the share `enough` of the wanted ones.
+        """
+        peers, balls, ways, own = self.peers, self._balls, len(self._shifts), self.peers.number
+        limits, most, found = self._limits[:, 1 - kind], self._most[:, 1 - kind], []
+        requests = np.column_stack([x[rows], rows, wanted])
+        for number, asked in enumerate(peers.exchange([requests] * peers.count)):
+            ends = asked[:, -1].copy()
+            for way in range(ways):
+                if number == own and not self._images[way].any():
+                    continue
+                side, centers = ways * (number + 1) - 1 - way, asked[:, :-2] - self._shifts[way]
+                near = gaps(np.tile(centers, 2), balls.boxes) - most < asked[:, -1:]
+                if kind:
+                    near[np.isin(asked[:, -2], self._rows[self._sides == side])] = False
+                for k in np.flatnonzero(near.any(axis=1)):
+                    others = balls.chunks.rows(np.flatnonzero(near[k]))
+                    others = others if kind else np.setdiff1d(others, self._sent[side])
+                    away = np.linalg.norm(balls.centers[others] - centers[k], axis=1)
+                    least = np.minimum(limits[others], np.maximum(used[others], (limits[others] + used[others]) / 2))
+                    limits[others] = np.clip(away - asked[k, -1], least, limits[others])
+                    ends[k] = np.min(away - limits[others], initial=ends[k])
+            found.append(ends)
+        ends = np.min(peers.exchange(found, np.full(peers.count, len(rows))), axis=0)
+        if peers.any(bool((ends < enough * wanted).any())):
+            return False
+        dim, groups = x.shape[1], balls.chunks.groups[rows]
+        self._limits[rows, 1 - kind] -= moves[rows]
+        self._limits[rows, kind], balls.centers[rows] = ends, x[rows]
+        np.maximum.at(self._most[:, kind], groups, ends)
+        np.minimum.at(balls.boxes[:, :dim], groups, x[rows])
+        np.maximum.at(balls.boxes[:, dim:], groups, x[rows])
+        return True
+
     def _ask_again(self, part: Part, needed: np.ndarray) -> bool:
         """Ask for the ghosts in balls of radii `needed` (n,). Return False if there are new ones."""
         x = part.points[: part.n_own].get().astype(float)
@@ -554,8 +632,11 @@ class PartSteps(DomainSteps):
         told, self._answers = self.peers.exchange([answers.settle(needed)] * self.peers.count), None
         for side, facing in answers.facing.items():
             facing.facts[:, -2:] = told[side // len(self._shifts)]
-        self._limits = np.column_stack(self._limits_of(answers.balls, answers.facing))
-        self._note(part.points)
+        self._balls, self._limits = answers.balls, np.column_stack(self._limits_of(answers.balls, answers.facing))
+        # A room without limit is that of a generator that all parts know.
+        finite = np.where(np.isinf(self._limits), 0, self._limits)[self._chunks.order]
+        self._most = np.maximum.reduceat(finite, self._chunks.firsts, axis=0)
+        self._send_limits(answers.balls.centers)
 
     def _ask(self, x: np.ndarray, radii: np.ndarray, needed: np.ndarray) -> Answers:
         """Ask for the generators in balls around own generators.
@@ -601,8 +682,8 @@ class PartSteps(DomainSteps):
         self._sides, self._rows = np.concatenate([self._sides, *sides]), np.concatenate([self._rows, rows])
         # All in the balls and their skins are known, while no generator moves.
         self._answers = replace(answers, new=[rows[:0] for rows in answers.new])
-        self._limits, self._at = np.zeros((len(self._caps), 2)), None
-        self._limits[:, 0] = (1 + SKIN) * answers.balls.radii
+        self._limits = np.column_stack([(1 + SKIN) * answers.balls.radii, np.zeros(len(self._caps))])
+        self._send_limits(answers.balls.centers)
         self._store()
 
     def _unknown(self, own: BallGroups, balls: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -630,19 +711,27 @@ class PartSteps(DomainSteps):
         A generator that another part does not know is at least a skin away from each ball of that part. Far from all
         other parts, the radius of a ball is a share of the distance to them.
         """
-        n = len(balls.radii)
-        free, room = np.full(n, np.inf), np.full(n, np.inf)
+        groups, k = balls.chunks.groups, len(balls.chunks.firsts)
+        # A row for each chunk, and one for each generator that is beside another part or known there.
+        places = np.zeros(len(groups), np.int32)
+        for side, f in facing.items():
+            places[f.balls] = places[self._sent[side]] = 1
+        alone = np.flatnonzero(places)
+        places[alone] = np.arange(k, k + len(alone))
+        free, room = np.full((2, k + len(alone)), np.inf)
         for side, f in facing.items():
             largest, skins = f.facts[:, -2], f.facts[:, -1]
-            ways = f.away.copy()
+            ways = np.append(f.away, f.away[groups[alone]])
+            ways[places[f.balls]] = f.apart
             rooms = np.maximum(ways - np.maximum(largest.max(), FREE * ways), ways * (1 - max(1 / NEAR, FREE)))
             rooms = np.maximum(skins.min(), rooms)
             if len(f.places):
                 firsts = np.flatnonzero(np.diff(f.places, prepend=-1))
-                rows, skin, largest = f.places[firsts], skins[f.others], largest[f.others]
+                rows, skin, largest = places[f.places[firsts]], skins[f.others], largest[f.others]
                 rooms_there = np.maximum(skin, f.ways - np.maximum(largest, FREE * f.ways))
                 ways[rows] = np.minimum(ways[rows], np.minimum.reduceat(f.ways, firsts))
                 rooms[rows] = np.minimum(rooms[rows], np.minimum.reduceat(rooms_there, firsts))
-            rooms[self._sent[side]] = np.inf
+            rooms[places[self._sent[side]]] = np.inf
             free, room = np.minimum(free, FREE * ways), np.minimum(room, rooms)
-        return np.maximum(balls.radii, free), room
+        rows = np.where(places, places, groups)
+        return np.maximum(balls.radii, free[rows]), room[rows]

@@ -64,7 +64,11 @@ def fetch_part(engine: Engine, domain: Domain, t: Tessellation, labels: cla.Arra
             # Where round-off may have spoiled cells, those of all ghosts fill the domain.
             return read_with(ghosts >= n)
 
-    return _LaterDiagram(points, read_all if (part.peers or ALONE).count == 1 else read)
+    if (part.peers or ALONE).count > 1:
+        return _LaterDiagram(points, read)
+    found = _LaterDiagram(points, read_all)
+    found.domain = domain
+    return found
 
 
 class _LaterDiagram(Diagram):
