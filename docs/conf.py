@@ -19,6 +19,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import matplotlib  # noqa: E402
 
 import clvoro  # noqa: E402
+from clvoro.geometry.domain import Domain  # noqa: E402
 
 matplotlib.use("Agg")
 warnings.filterwarnings("ignore", message=".*non-interactive.*")
@@ -125,9 +126,28 @@ def _escape_bars(app, what, name, obj, options, lines):
                 literal = indent
 
 
+_FOR_CALLERS = """boundary boundary_distance boundary_index boundary_names cell_dim contains dim extent lower measure
+n_pieces names nearest periodic piece_of upper with_lines with_surfaces wrap""".split()
+_OF_DOMAINS = {name for kind in Domain.__mro__ for name in vars(kind)}.difference(_FOR_CALLERS)
+_INTERNAL = """default_color framed_by watched Diagram.demand_cells Diagram.demand_voronoi Diagram.has_moved_vertices
+Diagram.with_arrays Faces.compact Faces.take_faces Faces.take_vectors Faces.with_half_faces Polygon.crossings
+Polygon.digest Polygon.edge_ends Polygon.edges_within Polygon.find_edges Polygon.geometry Polygon.is_slit
+projected Run.call_parts Run.conclude Run.fixed_count Run.note Run.record Solid.clearance Solid.closest
+Solid.corner_kinds Solid.corner_normals Solid.curvature Solid.feet_on_patch Solid.shell_volumes Solid.shells
+Solid.side_kinds Solid.widths""".split()
+
+
+def _leave_out(app, what, name, obj, skip, options):
+    """Leave members out of the pages of classes that only the package itself uses."""
+    function = getattr(obj, "fget", None) or getattr(obj, "func", None) or obj
+    whole = getattr(function, "__qualname__", name)
+    return True if name in _OF_DOMAINS or name in _INTERNAL or whole in _INTERNAL else None
+
+
 def setup(app):
-    """Register the renderer of formulas, and the changes of docstrings."""
+    """Register the renderer of formulas, and the changes of docstrings and members."""
     app.connect("autodoc-process-docstring", _escape_bars, priority=100)
+    app.connect("autodoc-skip-member", _leave_out)
     app.add_html_math_renderer("mathml", (_inline_math, None), (_block_math, None))
 
 

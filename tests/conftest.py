@@ -118,6 +118,15 @@ def adapter32(ctx):
 
 
 @pytest.fixture
+def here(request, tmp_path, monkeypatch):
+    """The present folder, in which there is only the file `HERE` of the module: a name and a text."""
+    monkeypatch.chdir(tmp_path)
+    name, text = request.module.HERE
+    (tmp_path / name).write_text(text)
+    return tmp_path
+
+
+@pytest.fixture
 def meshio_for_vtu():
     """The module, if it can read VTU: it wants base64 that stops at padding, as Python's did before 3.13."""
     meshio = pytest.importorskip("meshio")

@@ -554,10 +554,7 @@ class Domain(ClipBox):
     def require_globe(self, what: str, remedy: str) -> Sphere:
         """Return the sphere whose longitudes and latitudes positions have.
 
-        Raises
-        ------
-        InputError
-            If there is none; begins with `what`, and ends with `remedy`.
+        Raises `InputError` if there is none; begins with `what`, and ends with `remedy`.
         """
         if self.globe is None:
             raise InputError(f"{what}, not for {self}; {remedy}")
@@ -583,16 +580,12 @@ class Domain(ClipBox):
     def lift(self, points: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return what adds a coordinate to generators, so that cells of a power diagram are those of the nearest one.
 
-        Parameters
-        ----------
-        points, weights : (n, d), (n,) float
+        - `points`, `weights`: (n, d), (n,) float
 
-        Returns
-        -------
-        moved : (n, d) or () float
-            To be added to the positions.
-        heights : (n,) float
-            The further coordinate, which is 0 for other points: sqrt(max w - w_i) (Aurenhammer 1987).
+        Results:
+        - `moved` (n, d) or () float: to be added to the positions.
+        - `heights` (n,) float: the further coordinate, which is 0 for other points: sqrt(max w - w_i) (Aurenhammer
+          1987).
         """
         del points
         return np.zeros(()), np.sqrt(weights.max() - weights)
@@ -600,12 +593,8 @@ class Domain(ClipBox):
     def plane_shares(self, squares: np.ndarray, excess: np.ndarray) -> np.ndarray:
         """Return where the planes between two cells cross the lines of their generators, as shares of these, (k,).
 
-        Parameters
-        ----------
-        squares : (k,) float
-            Of the distances of the generators.
-        excess : (k,) float
-            By how much the weight of the second generator exceeds that of the first.
+        - `squares` (k,) float: of the distances of the generators.
+        - `excess` (k,) float: by how much the weight of the second generator exceeds that of the first.
         """
         return (1 - excess / squares) / 2
 
@@ -634,10 +623,7 @@ class Domain(ClipBox):
 
         `what` has them; `on_globe` says that they are longitudes and latitudes in degrees.
 
-        Raises
-        ------
-        InputError
-            If they have too few coordinates.
+        Raises `InputError` if they have too few coordinates.
         """
         if places.shape[1] < self.dim:
             raise InputError(
@@ -651,20 +637,13 @@ class Domain(ClipBox):
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return what lies between the boundary and the walls of a mesh, if walls may be curved.
 
-        Parameters
-        ----------
-        walls : callable
-            Returns the corners (t, 3, 3) of triangles of the walls, counter-clockwise from outside, and the sizes h of
-            the cells there, (t,). They bound the cells without gaps.
-        smallest : float
-            Volume over h^3 of the smallest parts, but for whole bodies and cavities.
+        - `walls`: returns the corners (t, 3, 3) of triangles of the walls, counter-clockwise from outside, and the
+          sizes h of the cells there, (t,). They bound the cells without gaps.
+        - `smallest`: volume over h^3 of the smallest parts, but for whole bodies and cavities.
 
-        Returns
-        -------
-        measures : (k,) float
-            Positive for parts of the domain, negative for parts of its outside.
-        places : (k, d) float
-            A point in each.
+        Results:
+        - `measures` (k,) float: positive for parts of the domain, negative for parts of its outside.
+        - `places` (k, d) float: a point in each.
         """
         return np.empty(0), np.empty((0, self.dim))
 
@@ -710,14 +689,9 @@ class Domain(ClipBox):
     ) -> FixedGenerators | None:
         """Return generators that must stay so that faces end in re-entrant corners and creases: none here.
 
-        Parameters
-        ----------
-        size : callable
-            Target size at points (k, d), (k,).
-        free : Domain
-            The domain without layers.
-        fixed : (m, d) array
-            Other generators that stay.
+        - `size`: target size at points (k, d), (k,).
+        - `free`: the domain without layers.
+        - `fixed` (m, d) array: other generators that stay.
         """
         del size, free, fixed
         return None
@@ -745,10 +719,7 @@ class Domain(ClipBox):
     def periods(self, real: np.dtype) -> np.ndarray:
         """Return the lengths of periods in the device's coordinates, (d,) float64; 0 across walls.
 
-        Raises
-        ------
-        InputError
-            If a period is shorter than 1000 units of round-off.
+        Raises `InputError` if a period is shorter than 1000 units of round-off.
         """
         step = float(np.finfo(real).eps)
         lengths = np.rint(self.extent / self.frame[1] / step) * step

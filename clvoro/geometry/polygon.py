@@ -394,10 +394,7 @@ class Polygon(Domain):
     def described(cls, **values: Any) -> Polygon:
         """Return the domain from the values that `describe` returns.
 
-        Raises
-        ------
-        InputError, InputTypeError
-            If the values do not describe a domain.
+        Raises `InputError` or `InputTypeError` if the values do not describe a domain.
         """
         made = cls.__new__(cls)
         made._build(pieces_of_description(values), values.get("names"), values.get("curves"))
@@ -439,17 +436,10 @@ class Polygon(Domain):
     def find_edges(self, what: str, walls: Walls | None) -> np.ndarray:
         """Return the places in `oriented` of the selected edges, (m,) int64, ascending.
 
-        Parameters
-        ----------
-        what : str
-            Name of the selection in error messages.
-        walls : int, str, sequence of both, (k,) bool or None
-            Numbers or names of edges; None selects all.
+        - `what`: name of the selection in error messages.
+        - `walls` int, str, sequence of both, (k,) bool or None: numbers or names of edges; None selects all.
 
-        Raises
-        ------
-        InputError, InputTypeError
-            If an edge or name does not exist, or none of the edges has a length.
+        Raises `InputError` or `InputTypeError` if an edge or name does not exist, or none of the edges has a length.
         """
         places = np.sort(self.oriented.places[self.boundaries.select(what, walls)])
         if places[-1] < 0:
@@ -612,12 +602,9 @@ class Polygon(Domain):
     def crossings(self, begin: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Find where segments from `begin` (n, 2) to `end` (n, 2) cross the boundary.
 
-        Returns
-        -------
-        rows, edges : (k,) int
-            Segment, and oriented edge.
-        t, u : (k,) float64
-            Place along the segment and along the edge, from 0 to 1.
+        Results:
+        - `rows`, `edges` (k,) int: segment, and oriented edge.
+        - `t`, `u` (k,) float64: place along the segment and along the edge, from 0 to 1.
         """
         segments = shapely.linestrings(np.stack([begin, end], axis=1))
         rows, edges = self.oriented.tree.query(segments, predicate="intersects")

@@ -293,10 +293,8 @@ class Sphere(Domain):
     def check_rows(self, name: str, points: object) -> np.ndarray:
         """Return positions of any length (n, 3), or longitudes and latitudes (n, 2), as positions on the sphere (n, 3).
 
-        Raises
-        ------
-        InputError, InputTypeError
-            If `points` is not an array of real numbers of such a shape, or a row is zero or not finite.
+        Raises `InputError` or `InputTypeError` if `points` is not an array of real numbers of such a shape, or a row is
+        zero or not finite.
         """
         shape = np.shape(points) if isinstance(points, list | tuple | np.ndarray) else ()
         if len(shape) == 2 and shape[1] == 2:

@@ -133,9 +133,11 @@ def test_the_last_row_is_that_of_the_mesh_with_layers_and_a_number_of_cells(adap
     assert result.check(), result.check()
 
 
-def press_anywhere(adapter, kind, times):
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", list(RUNS))
+def test_interruption_at_any_line(adapter, kind):
     """During a step, a refinement or a correction of the count: the mesh is valid, and its history ends with it."""
-    domain, options = RUNS[kind]
+    (domain, options), times = RUNS[kind], 40
     options = {"effort": "fast", "seed": 9, **options}
     with Pressed() as counted:
         adapter.run(domain, SIZE, **options)
@@ -149,15 +151,3 @@ def press_anywhere(adapter, kind, times):
             assert result.check(), f"{nth}: {result.check()}"
             assert len(result.points) == options.get("n_cells", len(result.points))
     assert came >= times // 2
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", ["counted", "coupled"])
-def test_interruption_at_some_lines(adapter, kind):
-    press_anywhere(adapter, kind, 4)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", list(RUNS))
-def test_interruption_at_any_line(adapter, kind):
-    press_anywhere(adapter, kind, 40)

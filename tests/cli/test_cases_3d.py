@@ -44,11 +44,7 @@ def twice():
     return off(CORNERS + moved, TRIANGLES + [tuple(i + 8 for i in t) for t in TRIANGLES])
 
 
-@pytest.fixture
-def here(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "mine.toml").write_text(CASE)
-    return tmp_path
+HERE = ("mine.toml", CASE)
 
 
 def call(*arguments):

@@ -32,11 +32,7 @@ def call(*arguments):
     return cli.main([str(a) for a in arguments])
 
 
-@pytest.fixture
-def here(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "small.toml").write_text(SMALL)
-    return tmp_path
+HERE = ("small.toml", SMALL)
 
 
 def write_netcdf(path, packed=False):

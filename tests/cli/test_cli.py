@@ -39,11 +39,7 @@ seed = 3141
 """
 
 
-@pytest.fixture
-def here(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "small.toml").write_text(CASE)
-    return tmp_path
+HERE = ("small.toml", CASE)
 
 
 def call(*arguments):

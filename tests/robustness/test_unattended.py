@@ -41,11 +41,7 @@ tol = 0
 FEW = {"method": "lloyd", "max_steps": 4, "options": clvoro.PaperOptions(tol=0.0)}
 
 
-@pytest.fixture
-def here(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "small.toml").write_text(CASE)
-    return tmp_path
+HERE = ("small.toml", CASE)
 
 
 def call(*arguments):

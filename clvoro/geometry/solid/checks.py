@@ -54,10 +54,7 @@ def repeated_triangles(triangles: np.ndarray) -> np.ndarray:
 def _gaps(surface: Surface, parts: Sequence[str]) -> str:
     """Return which parts have open edges, and how far those of the nearest other part are from them at most.
 
-    Parameters
-    ----------
-    parts : (t,) str
-        The part of each triangle.
+    - `parts` (t,) str: the part of each triangle.
     """
     names, part = np.unique(np.array(parts)[surface.open_sides // 3], return_inverse=True)
     if len(names) < 2:
@@ -82,19 +79,11 @@ def require_bounding(
 ) -> np.ndarray:
     """Raise unless the triangles (t, 3) bound a region with normals outwards; return the partners of their sides.
 
-    Parameters
-    ----------
-    surface : Surface
-        As given, for messages.
-    vertices, triangles : arrays
-        The welded surface.
-    parts : (t,) str
-        The name of the part that each triangle of `surface` belongs to, for messages.
+    - `surface`: as given, for messages.
+    - `vertices`, `triangles`: the welded surface.
+    - `parts` (t,) str: the name of the part that each triangle of `surface` belongs to, for messages.
 
-    Raises
-    ------
-    InputError
-        If the surface is open, has duplicate or flipped triangles, is inside out, or intersects itself.
+    Raises `InputError` if the surface is open, has duplicate or flipped triangles, is inside out, or intersects itself.
     """
     name = surface.name
     repeated = repeated_triangles(triangles)
