@@ -17,12 +17,15 @@ from ..opencl.engine import Engine
 from ..sizing.distance import Distance
 from ..sizing.field import Field, maximum, minimum
 from .estimates import check_memory
+from .sampling.start import density_tree
 
 _WALLS, _COMPRESSED, _FADING = 1024, 0.995, 0.4
 """Points on walls at which sizes are averaged; least factor on sizes that is neglected; share of the depth over which
 the factor grows to 1."""
 _GROWTH = 1.2
 """Growth of sizes beyond layers of constant height."""
+_ROUNDS = 3
+"""Rounds in which narrow places and the factor on the sizes follow each other."""
 _CLASS = 1.4
 """Columns whose widths differ by less than this factor have one distance field."""
 
@@ -67,12 +70,19 @@ class Layout:
 
 
 def lay_out(
-    engine: Engine, domain: Domain, field: Field, layers: Sequence[Layers], n_cells: int | None, n_fixed: int
+    engine: Engine,
+    domain: Domain,
+    field: Field,
+    layers: Sequence[Layers],
+    n_cells: int | None,
+    n_fixed: int,
+    scaled: bool,
 ) -> Layout:
     """Place `layers` in `domain`, and limit the size `field` beside them.
 
     - `n_cells`: number of cells that the caller wants.
     - `n_fixed`: number of fixed generators.
+    - `scaled`: whether all sizes are scaled to have `n_cells`.
 
     Raises `InputError` if layers meet or do not fit, or leave no cells of `n_cells` for the rest of the domain. Raises
     `MemoryLimitError`.
@@ -94,8 +104,7 @@ def lay_out(
             )
         limited = _beside_rows(field, made)
     if domain.borders is not None:
-        segments, sizes = domain.borders.narrow_places(made.free, limited)
-        limited = _limited(limited, segments, sizes, 1.0, math.log(_GROWTH))
+        limited = _beside_borders(engine, domain, made.free, limited, n_cells if scaled else None)
     return Layout(domain, made, field, limited)
 
 
@@ -118,6 +127,22 @@ def _before_prisms(field: Field, prisms: LayerPrisms) -> Field:
             ramp = Distance(walls, h_min=begin, slope=slope, h_max=1.0)
             field = field / maximum(ramp, ratio)
     return field
+
+
+def _beside_borders(engine: Engine, domain: Domain, free: Domain, field: Field, n_cells: int | None) -> Field:
+    """Return `field`, limited to sizes that grow from narrow places beside borders.
+
+    Places are narrow for the cells of the run: with `n_cells` all sizes are scaled to have that number.
+    """
+    limited, factor = field, 1.0
+    for _ in range(1 if n_cells is None else _ROUNDS):
+        cells = density_tree(limited, free).integral
+        if n_cells is not None:
+            cells, factor = n_cells, (cells / n_cells) ** (1 / domain.cell_dim)
+        check_memory(engine, cells, domain)  # before borders have generators
+        segments, sizes = domain.borders.narrow_places(free, lambda x, factor=factor: factor * np.asarray(field(x)))
+        limited = _limited(field, segments, sizes / factor, 1 / factor, math.log(_GROWTH) / factor)
+    return limited
 
 
 def _limited(field: Field, segments: np.ndarray, widths: np.ndarray, width: float, slope: float) -> Field:

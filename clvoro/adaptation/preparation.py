@@ -108,19 +108,22 @@ def prepare(stages: Stages, arguments: RunArguments, max_levels: int | None = No
     domain, _, options, points, fixed, _ = arguments
     _check_together(arguments)
     size = on_domain(domain, as_field(arguments.size))
-    layout = lay_out(stages.engine, domain, size, options.layers, options.n_cells, len(fixed))
+    layout = lay_out(
+        stages.engine, domain, size, options.layers, options.n_cells, len(fixed), scaled=options.multilevel
+    )
     kept_rows = None
     if points is not None and options.layers:
         kept_rows = layout.beyond(points)
         points = points[kept_rows]
     sizing = Sizing(stages.engine, domain, layout.field, gradient_step=GRADIENT_STEP)
     count = _count(layout, sizing, points, options)
+    most = max(count.target, 0 if points is None else len(points))
+    check_memory(stages.engine, most, domain)  # before creases have generators
     setup = _set_up(stages, layout, sizing, count, fixed, options)
     lattice = lattice_points(domain, count.target) if options.method in MOVING else None
     levels = _count_levels(setup, points, count.target, len(layout.layers.points), options) if options.multilevel else 0
     if options.levels == "auto" and max_levels is not None:
         levels = min(levels, max_levels)
-    most = max(count.target, 0 if points is None else len(points))
     check_prisms(layout.layers.prisms(lambda x: count.factor * sizing(x)))
     memory = _estimate_memory(setup, options, count, most, levels)
     return Prepared(options, setup, points, layout, count, lattice, levels, kept_rows, memory)

@@ -274,6 +274,19 @@ def test_what_does_not_fit_is_refused(ctx, dim, real):
         clvoro.Adapter(ctx, real).run(clvoro.Box((0,) * dim, (1,) * dim), 0.1, n_cells=int(1.02 * fits))
 
 
+@pytest.mark.parametrize(
+    "domain",
+    [
+        SQUARE.with_lines([[(0.2, 0.2), (0.7, 0.6)]]),
+        CUBE.with_surfaces({"heater": clvoro.Solid.box((0.3, 0.3, 0.3), (0.7, 0.7, 0.7))}),
+        clvoro.Solid.extruded(clvoro.Polygon([(0, 0), (2, 0), (2, 1), (1, 1), (1, 2), (0, 2)]), 0, 1),
+    ],
+)
+def test_what_does_not_fit_is_refused_before_borders_and_creases_have_generators(ctx, domain):
+    with pytest.raises(MemoryLimitError, match="same unit of length"):
+        clvoro.Adapter(ctx).run(domain, 1e-6)
+
+
 @pytest.mark.sparse(1)
 @pytest.mark.parametrize("real", ["float64", "float32"])
 @pytest.mark.parametrize(("domain", "size"), [(SQUARE, 0.016), (lake(), 0.012), (CUBE, 0.07)])

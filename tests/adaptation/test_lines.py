@@ -40,8 +40,12 @@ def test_levels_counts_and_wells_go_with_lines(ctx):
     wells = [(0.3, 0.9), (1.7, 0.2)]
     deep = clvoro.MultilevelOptions(levels=1)
     domain = BOX.with_lines([FAULT, BED])
-    mesh = clvoro.Adapter(ctx).run(domain, 0.06, "fast", fixed=wells, n_cells=700, options=deep)
+    adapter, given = clvoro.Adapter(ctx), {"fixed": wells, "n_cells": 700, "options": deep}
+    mesh = adapter.run(domain, 0.06, "fast", **given)
     assert len(mesh) == 700
+    # A number of cells scales all sizes, in narrow places, too.
+    scaled = adapter.run(domain, 6.0, "fast", **given, max_steps=1)
+    assert 100 * scaled.size_factor == pytest.approx(mesh.size_factor, rel=0.05)
     assert np.array_equal(mesh.points[:2], wells)
     assert covered(mesh) == pytest.approx(1, abs=1e-9)
 
