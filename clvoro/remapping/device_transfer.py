@@ -84,16 +84,8 @@ class CellData:
     def kernel_args(self) -> tuple[object, ...]:
         """CELL_DATA_ARGS of `transfer.cl`."""
         slopes = self.values if self.slopes is None else self.slopes
-        return (
-            self.cells,
-            np.int32(self.values.shape[1]),
-            self.values,
-            self.least,
-            self.most,
-            self.means,
-            np.int32(self.slopes is not None),
-            slopes,
-        )
+        values = np.int32(self.values.shape[1]), self.values, self.least, self.most, self.means
+        return self.cells, *values, np.int32(self.slopes is not None), slopes
 
 
 @dataclass(frozen=True)
@@ -195,14 +187,8 @@ class ConservativeTransfer:
         parts = np.searchsorted(old.pieces.cells, np.arange(n + 1))
         periods = np.zeros(4, engine.real)
         periods[: engine.dim] = graph.periods
-        rows = (
-            engine.upload(parts, np.int32),
-            *old.args,
-            engine.upload(graph.starts, np.int32),
-            engine.upload(graph.neighbors, np.int32),
-            engine.upload(graph.shifts, np.int8),
-            periods,
-        )
+        lists = engine.upload(graph.starts, np.int32), engine.upload(graph.neighbors, np.int32)
+        rows = engine.upload(parts, np.int32), *old.args, *lists, engine.upload(graph.shifts, np.int8), periods
         while True:
             cells = np.int32(width), *rows, *self._box, data.means, data.values, np.int32(limited)
             found = slopes, least, most, status
@@ -236,19 +222,9 @@ class ConservativeTransfer:
         results = *(engine.empty((k, width)) for _ in range(3)), engine.empty(k), engine.empty(k)
         status = engine.empty(k, np.int32)
         status.fill(DONE)
-        args = (
-            *new.args,
-            *old.args,
-            np.int32(tree.n),
-            np.int32(tree.levels),
-            engine.upload(tree.boxes),
-            engine.upload(entries[tree.order], np.int32),
-            engine.upload(shifts),
-            *self._box,
-            *data.kernel_args,
-            *results,
-            status,
-        )
+        boxes_args = np.int32(tree.n), np.int32(tree.levels), engine.upload(tree.boxes)
+        images = engine.upload(entries[tree.order], np.int32), engine.upload(shifts)
+        args = *new.args, *old.args, *boxes_args, *images, *self._box, *data.kernel_args, *results, status
         while order.size:
             engine.run_each(
                 self._kernels.transfer_cell_data, len(order), engine.upload(order, np.int32), *args, group=self._group

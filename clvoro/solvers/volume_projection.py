@@ -197,25 +197,13 @@ class VolumeProjection:
         summed = None if sums is None else PartialSums(sums, (0, 1))
         of_all = t.with_ghosts(self.engine, t.volumes, targets.h, targets.quality, displacement, sums=summed)
         volumes, h, quality, displacement = of_all
-        return (
-            t.face_measures,
-            t.face_centroids,
-            volumes,
-            t.points,
-            targets.gradient,
-            h,
-            quality,
-            targets.log_ratio,
-            displacement,
-            real(penalty.eps),
-            real(penalty.quality_scale),
-            real(min(penalty.eps, penalty.most_at_walls)),
-            real(penalty.at_walls * penalty.quality_scale),
-            real(penalty.log_ratio_scale),
-            penalty.power,
-            *((self._partial, 0) if sums is None else (sums, len(sums) // 2)),
-            *t.fixed_args(self.engine, labels, fixed),
-        )
+        cells = t.face_measures, t.face_centroids, volumes, t.points
+        aims = targets.gradient, h, quality, targets.log_ratio, displacement
+        at_walls = min(penalty.eps, penalty.most_at_walls), penalty.at_walls * penalty.quality_scale
+        scales = penalty.eps, penalty.quality_scale, *at_walls, penalty.log_ratio_scale
+        totals = (self._partial, 0) if sums is None else (sums, len(sums) // 2)
+        fixed_args = t.fixed_args(self.engine, labels, fixed)
+        return *cells, *aims, *map(real, scales), penalty.power, *totals, *fixed_args
 
     def _iterate(
         self, t: Tessellation, v: _Arrays, direction: Launch, update: Launch, limits: Limits

@@ -92,17 +92,8 @@ class CutCells:
         """Return the CELL_OUTPUT_ARGS of kernels (tessellation/row_counts.h)."""
         cells = self.cells["volumes"], self.cells["offsets"], self.cells["covariances"]
         keep, corners = self.corners is not None, report if self.corners is None else self.corners
-        return (
-            self.places,
-            self.counts,
-            self.labels,
-            self.measures,
-            self.centroids,
-            *cells,
-            report,
-            np.int32(self.state if keep else 0),
-            corners,
-        )
+        faces = self.places, self.counts, self.labels, self.measures, self.centroids
+        return *faces, *cells, report, np.int32(self.state if keep else 0), corners
 
 
 @dataclass

@@ -235,20 +235,9 @@ class Polyhedra(CellBuilder):
         of an earlier diagram, and its graph.
         """
         engine, size = self.engine, part.count
-        args = (
-            np.int32(len(cut.counts)),
-            binned.points,
-            binned.items,
-            *binned.search,
-            part.points,
-            *part.box.clip_args(engine),
-            np.int32(start[0]),
-            *start[1:],
-            np.int32(some),
-            np.int32(len(cut.labels)),
-            share,
-            *cut.output(self._report if report is None else report),
-        )
+        bins = binned.points, binned.items, *binned.search, part.points, *part.box.clip_args(engine)
+        chosen = np.int32(start[0]), *start[1:], np.int32(some), np.int32(len(cut.labels)), share
+        args = np.int32(len(cut.counts)), *bins, *chosen, *cut.output(self._report if report is None else report)
         by_team = None if some or self._team is None else self._team.get()
         if by_team is not None:
             engine.run(by_team, TEAM * size, np.int32(size), *args, group=TEAM)

@@ -153,18 +153,9 @@ class _Rounds:
     def update(self, size: int, which: int) -> None:
         """Update and check all cells, or the listed ones, at most `size`."""
         engine = self._engine
-        args = (
-            np.int32(which),
-            np.int32(self._n),
-            self._listed,
-            self._further,
-            *self._before,
-            *self._box.clip_args(engine),
-            *self._output,
-            self._more,
-            self._marks,
-            *engine.period_args,
-        )
+        given = np.int32(which), np.int32(self._n), self._listed, self._further, *self._before
+        written = *self._output, self._more, self._marks
+        args = *given, *self._box.clip_args(engine), *written, *engine.period_args
         engine.run_each(self._kernels.update_cells, size, *args)
         self.check()
 
@@ -178,11 +169,5 @@ class _Rounds:
     def list_marked(self, number: int, most: int) -> None:
         """List the marked cells, if they are not more than `most`. The report has room for the first rounds."""
         marks = self._more, self.cut.counts, self._marks, self._changed, self._listed, self._further
-        self._engine.run_each(
-            self._kernels.list_marked_cells,
-            self._n,
-            np.int32(most),
-            np.int32(min(number, MAX_ROUNDS - 1)),
-            *marks,
-            self._report,
-        )
+        limits = np.int32(most), np.int32(min(number, MAX_ROUNDS - 1))
+        self._engine.run_each(self._kernels.list_marked_cells, self._n, *limits, *marks, self._report)

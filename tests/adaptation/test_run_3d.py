@@ -27,19 +27,6 @@ def check(result, field, box=BOX, real="float64"):
 # Every method.
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("method", runs.FROM_POINTS)
-@pytest.mark.parametrize("dtype", ["float64", "float32"])
-def test_every_method(adapter, adapter32, dtype, method):
-    run = (adapter if dtype == "float64" else adapter32).run
-    planned = method in ("adaptive", "exact")
-    result = run(BOX, SMALL, method=method, seed=31, max_steps=None if planned else 12)
-    check(result, SMALL, real=dtype)
-    assert result.history["step"][-1] > 10
-    h = result.history
-    assert h["mean_quality"][-1] > h["mean_quality"][0] or method == "poisson"
-
-
 @pytest.mark.sparse(2)
 @pytest.mark.parametrize("method", runs.FROM_POINTS)
 def test_uniform_start_and_count(adapter, method):

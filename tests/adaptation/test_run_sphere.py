@@ -68,13 +68,6 @@ def test_methods_of_the_paper(ctx, method):
     assert result.diagram.volumes.sum() == pytest.approx(EARTH.measure, rel=1e-12)
 
 
-@pytest.mark.slow
-def test_number_of_cells(ctx):
-    result = clvoro.Adapter(ctx).run(EARTH, SIZE, n_cells=1000, effort="fast")
-    assert len(result.diagram) == 1000
-    assert clvoro.Adapter(ctx).run(EARTH, 1e6, effort="fast").size_factor == 1
-
-
 @pytest.fixture(scope="module")
 def quick(ctx):
     return clvoro.Adapter(ctx).run(EARTH, SIZE, effort="fast")

@@ -384,17 +384,6 @@ def solve(engine, W, seed=17, tolerance=1e-8):
     return solution, true
 
 
-def test_iterations_graded_and_weighted(make):
-    rng = np.random.default_rng(72)
-    # Spacing over two decades, density its inverse square.
-    points = (0.05 + 0.95 * rng.random((4000, 2))) ** 3
-    points = points[graphs.morton_order(points)]
-    graph = (points, *graphs.voronoi_graph(points))
-    assert solve(make(), weights_of(graph))[0].iterations <= 20
-    density = 1 / (1e-3 + points.prod(axis=1) ** (2 / 3))
-    assert solve(make(), weights_of(graph, density))[0].iterations <= 25
-
-
 @pytest.mark.sparse(1)
 @pytest.mark.parametrize("real", [np.float64, np.float32])
 @pytest.mark.parametrize("mesh", ["random", "refined"])

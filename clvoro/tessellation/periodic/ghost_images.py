@@ -113,19 +113,9 @@ class GhostImages:
         widest = np.ceil(halo.extremes.get().view(np.float32)[:d] * 2.0**20) / 2.0**20
         wide = np.minimum(periods, widest).astype(engine.real)
         box = ExtendedBox(lower - wide, upper + wide)
-        halo_args = (
-            np.int32(n),
-            np.append(periods, np.zeros(4 - d)).astype(engine.real),
-            *blocks,
-            engine.real.type(room * SIDEWAYS),
-            engine.real.type(room * OUTWARDS),
-            halo.kept,
-            halo.depths,
-            halo.extremes,
-            halo.requests,
-            self._report,
-            halo.most,
-        )
+        given = np.int32(n), np.append(periods, np.zeros(4 - d)).astype(engine.real), *blocks
+        rooms = engine.real.type(room * SIDEWAYS), engine.real.type(room * OUTWARDS), halo.kept
+        halo_args = *given, *rooms, *depths, halo.requests, self._report, halo.most
         return Part(n, count, extended, box, Ghosts(owners, codes, firsts), halo_args)
 
     def scale_far_measures(self, t: Tessellation, codes: cla.Array) -> cla.Array:

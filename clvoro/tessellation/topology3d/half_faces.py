@@ -72,19 +72,8 @@ def list_half_faces(engine: Engine, box: ClipBox, t: Tessellation) -> HalfFaces:
     corners, sharpness = engine.empty((c, 3)), engine.empty(c, np.float32)
     corner_faces, loops = engine.empty((c, 3), np.int32), engine.empty(3 * c, np.int32)
     labels, loop_starts = engine.empty(h, np.int32), engine.empty(h + 1, np.int32)
-    lists = (
-        capacities,
-        corner_starts,
-        starts,
-        corners,
-        sharpness,
-        corner_faces,
-        owners,
-        same,
-        labels,
-        loop_starts,
-        loops,
-    )
+    of_corners = corners, sharpness, corner_faces, owners, same
+    lists = capacities, corner_starts, starts, *of_corners, labels, loop_starts, loops
     for capacity in used:
         kernel = _kernels(engine, capacity).list_corners
         clip_each(engine, kernel, capacity, n, (*cell, *lists))
