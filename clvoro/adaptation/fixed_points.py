@@ -18,7 +18,6 @@ from ..errors import InputError, InputTypeError, MismatchWarning
 from ..geometry.domain import Domain
 from ..geometry.fixed_generators import FixedGenerators
 from ..mesh.diagram import Diagram
-from ..mesh.read_only import read_only
 from .tuning import AT_WALL, BEHIND_WALL, CANDIDATES, CLEARINGS, CLOSE, ON_WALL
 
 _ROUND_OFF = 1e-5
@@ -278,13 +277,13 @@ def clear_balls(
     return points[kept], labels[kept]
 
 
-def put_back(diagram: Diagram, fixed: np.ndarray) -> None:
-    """Give the first generators of `diagram` their exact positions `fixed` (k, d), except those that were moved."""
+def put_back(diagram: Diagram, domain: Domain, fixed: np.ndarray) -> None:
+    """Give the first generators of a `diagram` of `domain` their positions `fixed` (k, d), unless they have moved."""
     if len(fixed):
         points = diagram.points.copy()
-        near = np.abs(points[: len(fixed)] - fixed).max(axis=1) < _ROUND_OFF * diagram.domain.extent.max()
+        near = np.abs(points[: len(fixed)] - fixed).max(axis=1) < _ROUND_OFF * domain.extent.max()
         points[: len(fixed)][near] = fixed[near]
-        diagram._arrays["points"] = read_only(points)
+        diagram.put_points(points)
 
 
 def origins(labels: np.ndarray, started: int, taken: np.ndarray) -> np.ndarray:

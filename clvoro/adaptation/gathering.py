@@ -71,6 +71,6 @@ class ResultParts:
         order = np.argsort(np.concatenate(labels), kind="stable")
         engine = holder_of_all(self.engine, len(order), self.domain)
         diagram = rows.diagram(engine, self.domain)
-        put_back(diagram, self.fixed)
+        put_back(diagram, self.domain, self.fixed)
         arrays = {name: np.concatenate(values)[order] for name, values in found.items()}
         return dataclasses.replace(result, points=diagram.points, diagram=diagram, parts=None, **arrays)

@@ -116,7 +116,7 @@ def prepare(stages: Stages, arguments: RunArguments, max_levels: int | None = No
         kept_rows = layout.beyond(points)
         points = points[kept_rows]
     sizing = Sizing(stages.engine, domain, layout.field, gradient_step=GRADIENT_STEP)
-    count = _count(layout, sizing, points, options)
+    count = _count(layout, sizing, points, options, speaks=stages.engine.peers.number == 0)
     most = max(count.target, 0 if points is None else len(points))
     check_memory(stages.engine, most, domain)  # before creases have generators
     setup = _set_up(stages, layout, sizing, count, fixed, options)
@@ -214,8 +214,11 @@ def _check_together(arguments: RunArguments) -> None:
         )
 
 
-def _count(layout: Layout, sizing: Sizing, points: np.ndarray | None, options: Options) -> CellCount:
-    """Return the number of cells that the size field requires, and that of the finest level."""
+def _count(layout: Layout, sizing: Sizing, points: np.ndarray | None, options: Options, speaks: bool) -> CellCount:
+    """Return the number of cells that the size field requires, and that of the finest level.
+
+    - `speaks`: whether to warn of narrow parts, which one part of the domain does for all.
+    """
     domain, n_cells = layout.domain, options.n_cells
     # The other methods keep the number of given points.
     kept = points is not None and not options.multilevel
@@ -228,7 +231,7 @@ def _count(layout: Layout, sizing: Sizing, points: np.ndarray | None, options: O
         _warn_of_coarse_size(domain, required)
     scaled = options.multilevel and n_cells is not None
     factor = (required / target) ** (1 / domain.cell_dim) if scaled else 1.0
-    if tree is not None and required * factor**-domain.cell_dim >= 0.5:
+    if speaks and tree is not None and required * factor**-domain.cell_dim >= 0.5:
         warn_of_narrow_parts(domain, lambda x: factor * sizing(x))
     return CellCount(tree, required, target, factor)
 

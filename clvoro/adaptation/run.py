@@ -541,7 +541,7 @@ class Run:
             if (after := mesh.setup.after_layers) is not None:
                 size = np.where(diagram.layer > 0, np.cbrt(diagram.volumes), mesh.size_factor * after(diagram.points))
             error, quality = self._measured_again(diagram, size)
-        put_back(diagram, fixed[labels[labels < len(fixed)]] if self._is_part else fixed)
+        put_back(diagram, self._domain, fixed[labels[labels < len(fixed)]] if self._is_part else fixed)
         result = Result(
             points=diagram.points,
             diagram=diagram,

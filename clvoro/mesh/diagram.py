@@ -190,6 +190,10 @@ class Diagram(MeshOutput):
             derived += ["face_vertex_starts", "face_vertices"]
         return [n for n in self._NAMES if n in derived or n in self._arrays]
 
+    def put_points(self, points: np.ndarray) -> None:
+        """Replace the positions of generators by `points` (n, d), which differ by round-off."""
+        self._arrays["points"] = read_only(points)
+
     def with_arrays(self, **arrays: np.ndarray) -> Diagram:
         """Return a diagram with other arrays of these names, and its own ones otherwise."""
         made = Diagram(self.domain, {**self._arrays, **arrays})

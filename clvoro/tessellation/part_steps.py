@@ -401,7 +401,7 @@ class PartSteps(DomainSteps):
             return
         nearest = np.full((len(places), 2), np.inf)
         if len(x):
-            nearest = np.column_stack(scipy.spatial.cKDTree(x).query(places))
+            nearest = np.column_stack(scipy.spatial.cKDTree(x, compact_nodes=False, balanced_tree=False).query(places))
         found = np.array(self.peers.gather(nearest))
         owners = found[:, :, 0].argmin(axis=0)
         for number in np.unique(owners):

@@ -45,9 +45,9 @@ def test_generators_stay_and_their_cells_have_the_sizes(ctx, monkeypatch, dtype,
     domain, size, fixed, more = RUNS[kind]
     moved = []
 
-    def put_back(diagram, positions):
+    def put_back(diagram, of, positions):
         moved.append(np.abs(diagram.points[: len(positions)] - positions).max())
-        return original(diagram, positions)
+        return original(diagram, of, positions)
 
     original = run_module.put_back
     monkeypatch.setattr(run_module, "put_back", put_back)

@@ -14,6 +14,7 @@ from ...errors import InputError
 from ...geometry.box import Box
 from ...geometry.domain import Domain
 from ...mesh.diagram import Diagram
+from ...mesh.read_only import read_only
 from ...mesh.subset import take_subset
 from ...opencl.engine import Engine
 from ...opencl.peers import ALONE, Peers
@@ -83,8 +84,12 @@ class _LaterDiagram(Diagram):
     def _made(self) -> Diagram:
         check_process()
         made = self._read()
+        made.put_points(self.points)
         del self._read
         return made
+
+    def put_points(self, points: np.ndarray) -> None:
+        self.points = read_only(points)
 
     @cached_property
     def domain(self) -> Domain:
