@@ -19,7 +19,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import matplotlib  # noqa: E402
 
 import clvoro  # noqa: E402
-from clvoro.geometry.domain import Domain  # noqa: E402
+from clvoro.geometry.domain import FOR_CALLERS, Domain  # noqa: E402
 
 matplotlib.use("Agg")
 warnings.filterwarnings("ignore", message=".*non-interactive.*")
@@ -126,9 +126,7 @@ def _escape_bars(app, what, name, obj, options, lines):
                 literal = indent
 
 
-_FOR_CALLERS = """boundary boundary_distance boundary_index boundary_names cell_dim contains dim extent lower measure
-n_pieces names nearest periodic piece_of upper with_lines with_surfaces wrap""".split()
-_OF_DOMAINS = {name for kind in Domain.__mro__ for name in vars(kind)}.difference(_FOR_CALLERS)
+_OF_DOMAINS = {name for kind in Domain.__mro__ for name in vars(kind)} - FOR_CALLERS
 _INTERNAL = """default_color framed_by watched Diagram.demand_cells Diagram.demand_voronoi Diagram.has_moved_vertices
 Diagram.with_arrays Faces.compact Faces.take_faces Faces.take_vectors Faces.with_half_faces Polygon.crossings
 Polygon.digest Polygon.edge_ends Polygon.edges_within Polygon.find_edges Polygon.geometry Polygon.is_slit

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import clvoro
+from clvoro.geometry.domain import FOR_CALLERS
 
 PUBLIC = [getattr(clvoro, name) for name in clvoro.__all__] + [
     getattr(clvoro.sizing, name) for name in clvoro.sizing.__all__
@@ -56,6 +57,15 @@ def test_parameters_are_all_described(thing):
         assert listed == there, what
         domain = re.search(r"^domain : (.*)", part, re.MULTILINE)
         assert not domain or re.search("Box|Polygon", domain[1]), f"{what} does not say which domains it takes"
+
+
+def test_domains_list_what_is_for_callers():
+    for domain in (clvoro.Box((0, 0), (1, 1)), clvoro.Sphere(), clvoro.Polygon([(0, 0), (1, 0), (0, 1)])):
+        listed = {name for name in dir(domain) if not name.startswith("_")}
+        assert FOR_CALLERS <= listed
+        assert len(listed) < 50
+        assert hasattr(domain, "stations")
+        assert "stations" not in listed
 
 
 TESTED = set()

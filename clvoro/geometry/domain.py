@@ -34,6 +34,11 @@ if TYPE_CHECKING:
 
 LARGEST_EDGE = 1e50
 """Longest edge of a domain, and the inverse of the shortest: fifth powers of lengths must not overflow float64."""
+FOR_CALLERS = frozenset(
+    """boundary boundary_distance boundary_index boundary_names cell_dim contains dim extent lower measure n_pieces
+    names nearest periodic piece_of upper with_lines with_surfaces wrap""".split()
+)
+"""What all domains have for callers. Their other common members are what the package asks of a domain."""
 
 
 class ClipBox(ABC):
@@ -93,6 +98,10 @@ class Domain(ClipBox):
     names: Mapping[str, Walls] | None = None
     borders: Borders | None = None
     holes: Obstacles | None = None
+
+    def __dir__(self) -> list[str]:
+        common = {name for kind in Domain.__mro__ for name in vars(kind) if not name.startswith("__")}
+        return [name for name in super().__dir__() if name in FOR_CALLERS or name not in common]
 
     def with_lines(self, lines: object) -> Domain:
         """Return the same domain in 2D with lines inside, on which faces of the cells of a run lie.
