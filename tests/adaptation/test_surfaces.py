@@ -177,12 +177,14 @@ def test_what_is_refused_at_the_door(domain, surfaces, error):
         domain.with_surfaces(surfaces)
 
 
+@pytest.mark.filterwarnings("ignore::clvoro.errors.CoarseSizeWarning")
 @pytest.mark.parametrize(
     ("surfaces", "size", "error"),
     [
         (Solid.ball((0.5, 0.5, 0.5), 0.1), 0.15, "too curved"),
         ([rectangle(0, 1, 0.5), rectangle(0, 1, 0.55)], 0.1, "too near to each other"),
         (rectangle(0, 1, 0.995), 0.1, "a wall is too near"),
+        (Solid.box((0, 0, 0), (1, 1, 0.5)), 7.0, "smaller than the size"),
         (Solid.box((0, 0, 0), (1, 1, 1)), 0.1, "on the walls"),
         (Solid.box((0.3, 0.3, 0.3), (0.7, 0.7, 0.33)), 0.1, "is no edge"),
     ],

@@ -329,6 +329,7 @@ def test_damaged_descriptions(change):
         (lambda: ellipse((0, 0), (1, 0)), "semi_axes"),
         (lambda: ellipse((0, 0), (1, 1), start=0, end=400), "at most 360"),
         (lambda: naca("0012", chord=0), "chord is 0"),
+        (lambda: naca("0012", chord=1e160), r"extent of 1e\+160, expected 1e-50 to"),
         (lambda: naca("0012", trailing_edge="round"), "trailing_edge is 'round'"),
         (lambda: spline([(0, 0)]), "at least 2"),
         (lambda: spline([(0, 0), (1, 0), (0, 0)], closed=True), "at least 3"),

@@ -13,6 +13,7 @@ import numpy as np
 from ...arguments import check_number, format_point
 from ...errors import InputError, InputTypeError
 from ..boundary_names import WORD
+from ..domain import LARGEST_EDGE
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -181,6 +182,11 @@ class Curve:
             raise InputError(
                 f"{kind} has an extent of {self.extent:g} at {format_point(points[0])}, expected more "
                 "than round-off; make it larger, or move it to the origin"
+            )
+        if not 1 / LARGEST_EDGE <= self.extent <= LARGEST_EDGE:
+            raise InputError(
+                f"{kind} has an extent of {self.extent:g}, expected {1 / LARGEST_EDGE:g} to {LARGEST_EDGE:g}; choose "
+                "another unit of length"
             )
         given = arguments.get("tolerance")
         least = _ROUNDINGS * float(np.finfo(float).eps) * far

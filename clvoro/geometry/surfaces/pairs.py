@@ -312,6 +312,11 @@ class _Sample:
         clear[there[~on_wall]] = False
         clear &= ~_in_balls(around, self.cloud, h)
         self.raised = _relaxed(self.lifted, h**-2, h, np.column_stack([q, apart * patch]), count, clear)
+        if not len(self.raised):
+            raise InputError(
+                f"surfaces are smaller than the size at {format_point(self.cloud[0])}, {float(h[0]):.3g}, and no cell "
+                "has room beside them, expected smaller sizes there; do h and the domain have the same unit of length?"
+            )
         self.q, self.patch = self.raised[:, :3].copy(), np.rint(self.raised[:, 3] / apart).astype(int)
         feet = self._feet(self.q[n_fixed:], self.patch[n_fixed:])
         h = np.asarray(size(feet.point), float)
@@ -557,6 +562,8 @@ def _relaxed(
             kept = clear[scipy.spatial.KDTree(cloud).query(x)[1]]
             kept[:k] = True
             x = x[kept]
+    if not len(x):
+        return x
     used = np.bincount(scipy.spatial.KDTree(x).query(cloud)[1], minlength=len(x)) > 0
     used[:k] = True
     return x[used]
