@@ -447,8 +447,9 @@ class Adapter:
             Generators to start from: those of the array, random ones with density h^-d, or uniform random ones as in
             the paper. From an array, "adaptive" and "exact" only correct and polish a mesh that nearly has the sizes
             already (mean |e| up to 0.15, count off by 2 % at most, cells as good as after a run with this effort), as
-            after the size field has moved by a few cells. From any other array they run all levels. Where its number
-            of points is far from that of the sizes, random ones replace them, unless `options` has levels.
+            after the size field has moved by a few cells; see `MultilevelOptions`. From any other array they run all
+            levels. Where its number of points is far from that of the sizes, random ones replace them, unless `options`
+            has levels.
         method : str
             "adaptive" goes from coarse to fine, inserts and deletes generators, and ends with good cells of the right
             size. "exact" gives every cell its target size, to about 1e-4; "transport" to 1e-10 (float32: 1e-3), in a
@@ -471,7 +472,7 @@ class Adapter:
         max_steps : int, optional
             Largest number of steps, over all levels. By default 100, or all steps of the schedule of "adaptive",
             "exact" and "transport". From given points these leave out sweeps, so that their last steps, which polish,
-            are among them; a mesh that is near its sizes is not only corrected if `max_steps` allows more.
+            are among them.
         options : MultilevelOptions or PaperOptions, optional
             Further options: `MultilevelOptions` for those three methods, `PaperOptions` for the others.
         checkpoint : path or Checkpoint, optional

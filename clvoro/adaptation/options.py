@@ -44,6 +44,7 @@ _USERS = {
     "effort": _MULTILEVEL,
     "levels": _MULTILEVEL,
     "error_target": _MULTILEVEL,
+    "correct": _MULTILEVEL,
     "tol": (*PUBLISHED, *MOVING),
     "alpha": ("lloyd", "poisson", "coupled"),  # "lloyd" reports the correction that it leaves out
     "k": PUBLISHED,
@@ -93,6 +94,9 @@ class MultilevelOptions:
         with one level at .0007 to .0009. The shape is as good as it gets at a mean error of about .05 on steep fields,
         of .03 on smooth ones ("fast": .06 to .07, and .04). With a larger target the mesh stays there,
         ``settings["trade"]`` says so, and the largest error stays bounded to about .25 ("fast": .28).
+    correct : bool
+        Whether a mesh of the caller that nearly has the sizes is only corrected. A correction changes it little, and
+        many of them add up to cells of a poorer shape. With False the run takes all its steps.
 
     Raises
     ------
@@ -108,6 +112,7 @@ class MultilevelOptions:
 
     levels: int | Literal["auto"] = "auto"
     error_target: float | None = None
+    correct: bool = True
 
     def __post_init__(self) -> None:
         _check_numbers(self)
@@ -236,6 +241,7 @@ class Options:
     max_steps: int | None = None
     n_cells: int | None = None
     error_target: float | None = None
+    correct: bool = True
     layers: Sequence[Layers] = ()
 
     def __post_init__(self) -> None:

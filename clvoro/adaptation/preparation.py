@@ -26,7 +26,7 @@ from .moving.lattice import lattice_points
 from .options import Options, RunArguments
 from .plan.actions import Action, Prescribe
 from .plan.efforts import NEAR_COUNT, NEAR_ERROR, choose_error_target, is_near, steep_share
-from .plan.schedule import Begins, adaptive_schedule, auto_levels, n_steps, repeated_schedule
+from .plan.schedule import Begins, adaptive_schedule, auto_levels, repeated_schedule
 from .sampling.quadrature import DensityTree
 from .sampling.start import charted, density_tree, replace_far, sample_density, sample_uniform
 from .stages import Stages
@@ -418,10 +418,10 @@ def judge_points(prepared: Prepared, mesh: MeshState) -> tuple[Beginning, Prepar
     near = not prepared.levels and is_near(prepared.setup.domain.cell_dim, options.effort, n, missing, mean, quality)
     off = f"{abs(missing) / n:.1%} of the cells too {'few' if missing > 0 else 'many'}"
     found = f"mean |e| {mean:.2g}, {off}, mean Q {quality:.3f}"
-    if near and (options.max_steps or 0) <= n_steps(plan(prepared, "near").schedule):
+    if near and options.correct:
         return Beginning("near", f"the given mesh is near and only corrected ({found})"), prepared
     if near:
-        return Beginning("mesh", f"the given mesh is near, and max_steps allows more steps ({found})"), prepared
+        return Beginning("mesh", f"the given mesh is near, and all steps were taken ({found}; correct=False)"), prepared
     if options.levels == "auto" and (after := without_far(prepared)) is not prepared:
         if after.points is None:
             return Beginning(

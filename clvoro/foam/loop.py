@@ -18,7 +18,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from ..adaptation.options import EffortName
+from ..adaptation.options import EffortName, MultilevelOptions
 from ..adapter import Adapter
 from ..arguments import check_integer, check_number, warn
 from ..errors import InputError, InputTypeError, LostFieldsWarning, MismatchWarning
@@ -428,6 +428,7 @@ class _Loop:
             n_cells=self.n_cells,
             layers=layers,
             max_steps=None if self.window else _STEPS[self.effort],
+            options=MultilevelOptions(correct=bool(self.window)),
         )
         mesh_seconds = time.perf_counter() - start
         zones = old.zones_on(made.diagram)

@@ -26,7 +26,7 @@ LARGEST = 0.8
 """Largest size of an estimate, and of cells on a coarse level, over the largest one that a domain allows: a run may
 still make all sizes a little larger to meet a number of cells."""
 SMOOTHED = 2
-"""Number of passes that smooth sizes from second derivatives. These are noisy, and change their sign in a layer."""
+"""Number of passes that smooth sizes from second derivatives. These are noisy, and 0 in the middle of a layer."""
 
 
 class Estimate(OnCells):
@@ -235,12 +235,14 @@ def estimate(
 
     The sizes are those of `best_sizes`, which also takes the `bounds`: `n_cells`, `eps`, `h_min` and `h_max`. They are
     smoothed in `smoothed` passes after their growth is limited, so that a peak of the indicator stays narrow. What is
-    promised holds afterwards: growth is limited again, and sizes are scaled where the error exceeds `eps`.
+    promised holds afterwards: growth is limited again, and sizes are scaled where the error exceeds `eps`. Before, gaps
+    of the indicator that are less than two cells wide are filled: a mesh cannot follow them.
     """
     slope = check_slope(what, growth, None)
     stencils = CellStencils.of(on)
     places = _places(stencils, slope, smoothed)
-    sizes = best_sizes(what, indicator, places, order=order, p=p, constant=constant, **bounds)
+    filled = stencils.bounds(stencils.bounds(indicator)[1])[0] if smoothed else indicator
+    sizes = best_sizes(what, filled, places, order=order, p=p, constant=constant, **bounds)
     made = Estimate(stencils.mesh, sizes, constant * indicator * sizes**order, order, p)
     eps = bounds["eps"]
     if eps is None or made.norm <= eps * (1 + 1e-9):
