@@ -11,6 +11,7 @@ from typing import Concatenate, ParamSpec, TypeVar
 from .adapter import Adapter
 from .errors import DeviceError
 from .io import READERS
+from .io.foam_read import load_foam
 from .io.vtu_read import load_pvtu
 
 Arguments = ParamSpec("Arguments")
@@ -56,3 +57,4 @@ power_diagram = _by_all("power_diagram", Adapter.power_diagram)
 transport = _by_all("transport", Adapter.transport)
 
 READERS[".pvtu"] = functools.partial(load_pvtu, tessellate=voronoi)
+READERS[".foam"] = functools.partial(load_foam, tessellate=voronoi)

@@ -474,7 +474,7 @@ def _readable(name: str) -> str:
     from ..io.foam_read import refuse_polymesh
 
     refuse_polymesh(name)
-    if Path(name).suffix.lower() not in (".npz", ".vtu", ".pvtu", ".nc"):
+    if Path(name).suffix.lower() not in (".npz", ".vtu", ".pvtu", ".nc", ".foam"):
         what = "is no mesh" if Path(name).exists() else "does not exist"
         raise InputError(
             f"{name} {what}, expected a .npz, .vtu, .pvtu or .nc file (to check, also .foam or a case's folder)"

@@ -34,7 +34,7 @@ __all__ = ["Disv", "DisvBoundary", "check_writable", "load", "make_folder", "sav
 CONVENTIONS: dict[str, Callable[[Contents, Path, str], None]] = {"ugrid": write_ugrid}
 """Writers of ``.nc`` files; `earth` adds those of its models."""
 READERS: dict[str, Callable[[str | PathLike[str]], Result | Diagram]] = {".vtu": load_vtu}
-"""Readers by suffix, besides that of ``.npz``; `earth` adds ``.nc``, and `shared` ``.pvtu``."""
+"""Readers by suffix, besides that of ``.npz``; `earth` adds ``.nc``, and `shared` ``.pvtu`` and ``.foam``."""
 
 
 def load(path: str | PathLike[str]) -> Result | Diagram:
@@ -45,7 +45,8 @@ def load(path: str | PathLike[str]) -> Result | Diagram:
     compared with the bytes in the file before memory is allocated, and arrays must be consistent.
 
     A ``.pvtu`` file and its pieces hold the mesh of all ranks. Cells are made again on the best device, and are in the
-    order of ranks.
+    order of ranks. ``CASE/mesh.foam`` of a decomposed case of OpenFOAM that clvoro wrote is read as a diagram, from the
+    generators beside the meshes of processors.
 
     A ``.nc`` file of a mesh on a sphere may also be of another program. Generators, cells, neighbors and the generators
     behind a boundary are those that were saved, up to round-off; the boundary has one name, and corners may have other
@@ -68,10 +69,6 @@ def load(path: str | PathLike[str]) -> Result | Diagram:
         fault.
     """
     path = check_path("path", path)
-    if Path(path).suffix.lower() == ".foam":
-        from .foam_read import refuse_polymesh
-
-        refuse_polymesh(path)
     return READERS.get(Path(path).suffix.lower(), load_npz)(path)
 
 

@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
 _WORD = re.compile(r"[A-Za-z_][A-Za-z0-9_.-]*")
+DOMAIN = " clvoro domain: "
+"""What precedes the domain of the whole mesh in a comment of a file."""
 OWN = frozenset(
     (
         "size",

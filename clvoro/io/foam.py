@@ -12,6 +12,7 @@ order of the file; `translational` demands one vector for all. OpenFOAM's decomp
 
 from __future__ import annotations
 
+import json
 import re
 import sys
 from collections.abc import Iterable, Iterator, Mapping
@@ -32,7 +33,7 @@ from ..mesh.connectivity import slices
 from ..mesh.diagram import Diagram
 from ..mesh.faces import Faces
 from .atomic import atomic_file, atomic_folder, make_folder
-from .contents import Contents
+from .contents import DOMAIN, Contents, describe
 from .foam_parts import ADDRESSING, FoamPatch, FoamPiece, decompose, processors_of
 
 if TYPE_CHECKING:
@@ -181,7 +182,10 @@ _FILES = {
     "boundary": "polyBoundaryMesh",
     "faces": "faceList",
 }
-_OTHERS = ("cellZones", "faceZones", *ADDRESSING)
+GENERATORS = "generators"
+"""A file of clvoro's own beside those of a processor: the generators of its cells, on the first one behind a comment
+with the domain."""
+_OTHERS = ("cellZones", "faceZones", *ADDRESSING, GENERATORS)
 _BYTE_ORDER = {"little": "LSB", "big": "MSB"}[sys.byteorder]
 _CHUNK = 1 << 14
 
@@ -254,11 +258,16 @@ def write_foam(
             head = _header("decomposeParDict", "", False).replace("regIOobject", "dictionary")
             coefficients = f"simpleCoeffs\n{{\n    n ({count} 1 1);\n    delta 0.001;\n}}\n"
             file.write(f"{head}numberOfSubdomains {count};\nmethod simple;\n{coefficients}".encode("ascii"))
+    diagram, domain = contents.diagram, json.dumps(describe(contents.diagram.domain))
+    points = np.pad(diagram.points, ((0, 0), (0, 3 - diagram.domain.dim)))
     for number, piece in enumerate(decompose(mesh, made, part)):
         own_cells = {name: piece.local_cells(rows) for name, rows in of_cells.items()}
         own_faces = {name: piece.local_faces(*rows) for name, rows in of_faces.items()}
         place = folder.parent.parent / f"processor{number}" / "constant" / "polyMesh"
-        _write_piece(piece, place, changed, binary, own_cells, own_faces, piece.addressing)
+        own = _text(len(piece.cells), _vectors(points[piece.cells])) if len(points) == mesh.n_cells else ()
+        more = {name: _text(len(numbers), _labels(numbers)) for name, numbers in piece.addressing.items()}
+        more |= {GENERATORS: chain([f"//{DOMAIN}{domain}\n".encode()] * (number == 0), own)} if own else {}
+        _write_piece(piece, place, changed, binary, own_cells, own_faces, more)
 
 
 def _refuse_other_processors(folder: Path, count: int) -> None:
@@ -283,9 +292,9 @@ def _write_piece(
     binary: bool,
     of_cells: Mapping[str, np.ndarray],
     of_faces: Mapping[str, tuple[np.ndarray, np.ndarray]],
-    addressing: Mapping[str, np.ndarray] | None = None,
+    more: Mapping[str, Iterable[bytes]] | None = None,
 ) -> None:
-    """Write the files of one polyMesh. Remove files of zones and `addressing` that an earlier mesh has left."""
+    """Write the files of one polyMesh, and `more` lists. Remove files that an earlier mesh has left."""
     inner = len(piece.neighbor)
     make_folder(folder)
     note = f"nPoints:{len(piece.points)} nCells:{len(piece.cells)} nFaces:{len(piece.owner)} nInternalFaces:{inner}"
@@ -310,8 +319,7 @@ def _write_piece(
     if of_faces:
         made = [_zone(name, rows, "face", against) for name, (rows, against) in of_faces.items()]
         lists["faceZones"] = _text(len(made), made)
-    for name, numbers in (addressing or {}).items():
-        lists[name] = _text(len(numbers), _labels(numbers))
+    lists |= more or {}
     # `faces` is moved last: a case without it is recognized as incomplete.
     with atomic_folder(folder / "faces") as target:
         for name in [*(other for other in _OTHERS if other in lists), *_FILES]:
@@ -325,7 +333,7 @@ def _write_piece(
 
 
 def _header(name: str, note: str, binary: bool) -> str:
-    kind = "labelList" if name in ADDRESSING else _FILES.get(name, "regIOobject")
+    kind = "labelList" if name in ADDRESSING else (_FILES | {GENERATORS: "vectorField"}).get(name, "regIOobject")
     if binary and name == "faces":
         kind = "faceCompactList"
     noted = f'    note        "{note}";\n' if note else ""

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import gzip
+import json
 import re
+from collections.abc import Callable
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
@@ -16,10 +18,13 @@ from ..finite_volumes.criteria import SolverReport
 from ..finite_volumes.gate import openfoam_report
 from ..finite_volumes.measures import SolverMeasures
 from ..geometry.box import Box
+from ..geometry.domain import Domain
 from ..mesh.connectivity import following, take_rows
+from ..mesh.diagram import Diagram
 from ..mesh.faces import Faces
 from .arrays import FileError, explained
-from .foam import polymesh_folder
+from .contents import DOMAIN, described
+from .foam import GENERATORS, polymesh_folder
 
 _HEAD = re.compile(rb"FoamFile\s*\{(.*?)\}", re.DOTALL)
 _COMMENTS = re.compile(rb"/\*.*?\*/|//[^\n]*", re.DOTALL)
@@ -280,13 +285,40 @@ class FoamFile:
         return made
 
 
+def load_foam(path: str | PathLike[str], tessellate: Callable[[Domain, np.ndarray], Diagram]) -> Diagram:
+    """Read the mesh of a decomposed case from the generators beside the meshes of its processors.
+
+    `tessellate` makes the cells again. Their order is that of the mesh before it was decomposed.
+
+    Raises `InputError` if a processor has no generators.
+    """
+    refuse_polymesh(path)
+    folders = _with_generators(path)
+    with explained(path, "a decomposed case that save or to_openfoam wrote"):
+        said = re.search(f"//{DOMAIN}(.*)\n".encode(), read_with_head(folders[0] / GENERATORS)[1])
+        rows = np.concatenate([FoamFile.read(folder, "cellProcAddressing").labels() for folder in folders])
+        found = np.concatenate([FoamFile.read(folder, GENERATORS).vectors() for folder in folders])
+        if said is None or not np.array_equal(np.sort(rows), np.arange(len(found))):
+            raise FileError("its processors are not those of one mesh; write it again")
+        domain = described(json.loads(said[1]))
+        return tessellate(domain, found[np.argsort(rows), : domain.dim])
+
+
+def _with_generators(path: str | PathLike[str]) -> list[Path]:
+    """Return the folders of all processors of the case of a file ``.foam``, if they have generators; else none."""
+    case = Path(path).parent
+    folders = [case / f"processor{k}" / "constant" / "polyMesh" for k in range(len([*case.glob("processor*")]))]
+    there = Path(path).suffix.lower() == ".foam" and all((folder / GENERATORS).exists() for folder in folders)
+    return folders if there else []
+
+
 def refuse_polymesh(path: str | PathLike[str]) -> None:
-    """Raise an error if `path` is OpenFOAM's mesh, which can be checked and not loaded.
+    """Raise an error if `path` is OpenFOAM's mesh, which can be checked and not loaded, and has no generators.
 
     Raises `InputError`.
     """
-    if polymesh_folder(path) is not None:
+    if polymesh_folder(path) is not None and not _with_generators(path):
         raise InputError(
             f"cannot load {path}: OpenFOAM's meshes have no generators; load the mesh.npz or mesh.vtu of the same run, "
-            "or check this one with `clvoro check`"
+            "or a case that clvoro has decomposed, or check this one with `clvoro check`"
         )

@@ -27,7 +27,7 @@ from ..mesh.diagram import Diagram
 from ..mesh.faces import Faces
 from ..mesh.straightening import count_sides
 from .atomic import atomic_file
-from .contents import Contents, describe
+from .contents import DOMAIN, Contents, describe
 
 SOLVER_MESH = "clvoro solver mesh: the cells are not those of a diagram"
 _BLOCK = 1 << 20
@@ -91,10 +91,6 @@ _"""
         for chunk in appended.chunks:
             file.write(chunk)
         file.write(b"\n</AppendedData>\n</VTKFile>\n")
-
-
-DOMAIN = " clvoro domain: "
-"""What precedes the domain of the whole mesh in a comment of the index."""
 
 
 def write_pvtu(contents: Contents, path: Path) -> None:

@@ -32,8 +32,8 @@ from ..mesh.diagram import Diagram
 from ..mesh.results import Result, result_of_file
 from ..mesh.straightening import cell_quality
 from .arrays import EXPANSION, LEAST, FileError, explained
-from .contents import described
-from .vtu import DOMAIN, KINDS, SOLVER_MESH
+from .contents import DOMAIN, described
+from .vtu import KINDS, SOLVER_MESH
 
 LONGEST_HEAD = 1 << 22
 MARK = b'<AppendedData encoding="raw">\n_'

@@ -67,6 +67,10 @@ def test_processors_have_the_whole_mesh_and_match_each_other(meshes, tmp_path, n
     assert np.array_equal(np.sort(np.concatenate(cells)), np.arange(len(mesh)))
     assert max(map(len, cells)) - min(map(len, cells)) <= 1
     assert (seen[len(neighbor) :] == 1).all()
+    loaded = clvoro.load(tmp_path / "case.foam")
+    assert loaded.domain == mesh.domain
+    assert np.array_equal(loaded.points, mesh.points)
+    assert np.allclose(loaded.volumes, mesh.volumes, rtol=1e-12)
     for patch, (kind, loops) in between.items():
         ends, _, seam = patch.removeprefix("procBoundary").partition("through")
         p, q = ends.split("to")
