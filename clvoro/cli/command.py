@@ -409,6 +409,8 @@ def _explain(error: BaseException) -> tuple[object, int]:
         return error, BAD_INPUT
     except DeviceError:
         return error, NO_DEVICE
+    except PermissionError as closed:  # of a folder on the way to a file
+        return f"cannot reach {closed.filename}: {closed.strerror}", BAD_INPUT
     except (ClvoroError, OSError):
         return error, FAILED
     except MemoryError:

@@ -184,6 +184,7 @@ def test_sizes_from_fields_of_other_programs(tmp_path):
         ("", ["lacks size"]),
         ("[size]\nkind = 'distnce'", ["size.kind", "did you mean 'distance'"]),
         ("[size]\nkind = 'raster'", ["size", "lacks file"]),
+        ("[size]\nh_min = 1", ["size lacks kind; expected kind = one of constant, "]),
         ("[size]\nkind = 'distance'\nhmin = 0.1\nshapes = []", ["size", "'hmin'", "did you mean 'h_min'"]),
         (
             "[size]\nkind='distance'\nh_min=1\nslope=1\ngrowth=2\nshapes=[{kind='circle',center=[0,0],radius=1}]",

@@ -409,21 +409,22 @@ def test_errors_are_one_message(here, capsys, arguments, code, named):
 
 
 @pytest.mark.parametrize(
-    ("error", "code"),
+    ("error", "code", "said"),
     [
-        (DeviceError("no device"), cli.NO_DEVICE),
-        (BuildError("no build"), cli.FAILED),
-        (MemoryLimitError("no room"), cli.FAILED),
-        (OSError("disk full"), cli.FAILED),
+        (DeviceError("no device"), cli.NO_DEVICE, "no device"),
+        (BuildError("no build"), cli.FAILED, "no build"),
+        (MemoryLimitError("no room"), cli.FAILED, "no room"),
+        (OSError("disk full"), cli.FAILED, "disk full"),
+        (PermissionError(13, "denied", "a/b"), cli.BAD_INPUT, "cannot reach a/b: denied"),
     ],
 )
-def test_exit_codes_of_failures(here, monkeypatch, capsys, error, code):
+def test_exit_codes_of_failures(here, monkeypatch, capsys, error, code, said):
     def fail(*_, **__):
         raise error
 
     monkeypatch.setattr(clvoro, "create_context", fail)
     assert call("run", "small.toml") == code
-    assert capsys.readouterr().err == f"clvoro: {error}\n"
+    assert capsys.readouterr().err == f"clvoro: {said}\n"
 
 
 @pytest.mark.skipif(os.name == "nt" or os.geteuid() == 0, reason="root may write anywhere")

@@ -92,7 +92,8 @@ def _explain(message: str, kind: Any, content: object, place: str, homes: Mappin
     tables, others = _types_at(inspect.type_info(kind), content, keys)
     if text.startswith("Object"):
         known = [f.encode_name for table in _chosen(tables, got) for f in table.fields]
-        takes = f"it takes {', '.join(known or ['kind'])}"
+        tags = [str(table.tag) for table in tables]
+        takes = f"it takes {', '.join(known)}" if known else f"expected kind = one of {', '.join(tags)}"
         if "missing" in text:
             return f"{where} lacks {name}; {takes}"
         kinds = [repr(t.tag) for t in tables if any(name == f.encode_name for f in t.fields)]
