@@ -612,6 +612,7 @@ class SolidTable(Kind, tag="solid"):
     join: NotNegative | None = None
     repair: bool | None = None
     wrap: Positive | None = None
+    inside: Space | None = None
     surfaces: Text | list[SurfaceTable] | None = None
 
     def build(self, folder: Path, domain: Any = None) -> Solid:

@@ -75,8 +75,10 @@ def library() -> Any:
     return manifold3d
 
 
-def boolean(operation: str, *parts: NamedTriangles) -> dict[str, Any]:
+def boolean(operation: str, *parts: NamedTriangles, simpler: float = 0.0) -> dict[str, Any]:
     """Return the arguments of the sum (+) or common part (^) of solids, or of the first without the others (-).
+
+    Triangles become fewer where the surface moves by less than the distance `simpler`.
 
     Raises `MissingLibraryError` if manifold3d is not installed. Raises `InputError` if nothing is left.
     """
@@ -99,7 +101,8 @@ def boolean(operation: str, *parts: NamedTriangles) -> dict[str, Any]:
             raise InputError(f"a boolean of solids got a surface that manifold3d refuses: {made.status().name}")
         manifolds.append(made)
     kinds = {"+": manifold3d.OpType.Add, "-": manifold3d.OpType.Subtract, "^": manifold3d.OpType.Intersect}
-    result = manifold3d.Manifold.batch_boolean(manifolds, kinds[operation]).to_mesh64()
+    whole = manifold3d.Manifold.batch_boolean(manifolds, kinds[operation])
+    result = (whole.simplify(simpler) if simpler else whole).to_mesh64()
     if not len(result.tri_verts):
         raise InputError("a boolean of solids leaves nothing, expected a region; do the solids overlap?")
     lengths = np.diff(np.asarray(result.run_index).astype(np.int64)) // 3

@@ -41,6 +41,7 @@ _FACING = -0.7  # product of the normals of two walls that face each other
 _SAMPLES = 2048  # places on the surface from which the search for nearest points begins, besides vertices
 _MOST_STEPS = 64  # along a side of a triangle
 _WRAPPED = 150.0  # degrees: a wrap has no creases
+_SOFT = math.radians(60)  # borders of groups at which a wrap turns by less take the mean angle of all between the two
 _MARGIN = 0.05  # of the longest edge, by which the clip box is larger than the region
 
 
@@ -155,8 +156,10 @@ class Solid(Domain):
     wrap : float, optional
         Take a closed surface around all triangles in their place, whatever is wrong with them. It is about wrap / 2
         outside of them, and closes holes and gaps up to 2 wrap wide; sheets become plates as thick as `wrap`. What is
-        finer is left out, with sharp edges and groups. A warning says how far the surface is from the triangles at
-        most. It suits cells of 1.5 wrap, or smaller ones.
+        finer is left out, with sharp edges. Groups that `names` mentions stay, all others become one: ``wall``. A
+        warning says how far the surface is from the triangles at most. It suits cells of 1.5 wrap, or smaller ones.
+    inside : three numbers, optional
+        A point: with `wrap`, the solid is the space around this point, up to about wrap / 2 from the triangles.
 
     Attributes
     ----------
@@ -204,6 +207,7 @@ class Solid(Domain):
         repair: bool = False,
         creases: object = None,
         wrap: float | None = None,
+        inside: Sequence[float] | None = None,
     ):
         given = Surface(vertices, triangles, name, join)
         group = _checked_groups(name, groups, len(given))
@@ -215,12 +219,24 @@ class Solid(Domain):
         if repair:
             given, group, self.repairs, holes = repaired(given, group, len(known))
             self._group_names += tuple(f"hole-{k + 1}" for k in range(holes))
+        if wrap is None and inside is not None:
+            raise InputError(f"{name} has inside without wrap, expected a point in the space that a wrap bounds")
         if wrap is not None:
             if creases is not None:
                 raise InputError(f"{name} has creases and wrap, expected one of them: a wrap has other vertices")
-            given, done = wrapped(given, wrap)
-            group, self.repairs = np.zeros(len(given), np.int64), (*self.repairs, done)
-            self._group_names = ("wall",) if len(known) > 1 else tuple(known)
+            kept = _kept_groups(name, names, self._group_names)
+            place = np.zeros(len(self._group_names), np.int64)
+            place[[self._group_names.index(k) for k in kept]] = 1 + np.arange(len(kept))
+            given, group, done = wrapped(given, wrap, inside, place[group])
+            self.repairs = (*self.repairs, done)
+            rest = known[0] if len(known) == 1 else "rest" if "wall" in kept else "wall"
+            self._group_names = (rest, *kept)
+            lost = [k for k in kept if k not in (self._group_names[g] for g in np.unique(group))]
+            if lost:
+                raise InputError(
+                    f"{name} has no place for {lost[0]!r} on its wrap, which is nearer to other groups, or larger; "
+                    "leave out that group or its file, or use a smaller wrap"
+                )
             angle = _WRAPPED if angle is None else angle
         places, merged = given.welded
         self._places = given.places
@@ -237,6 +253,12 @@ class Solid(Domain):
         turns = dihedral_turns(vertices, triangles, self.twin, self.normals)
         across = self._group[self.twin // 3] != np.repeat(self._group, 3)
         border = (np.abs(turns) > math.radians(self.angle)) | across | self._drawn(creases)
+        if self.angle >= 90:  # a wrap is rough, and borders of its groups are convex or concave as a whole
+            soft = np.flatnonzero(across & (np.abs(turns) < _SOFT))
+            pair = np.sort(self._group[np.stack([soft, self.twin[soft]]) // 3], axis=0)
+            _, place = np.unique(pair, axis=1, return_inverse=True)
+            place = place.reshape(-1)
+            turns[soft] = (np.bincount(place, turns[soft]) / np.bincount(place))[place]
         self.patch, self.creases, self.corners = find_creases(vertices, triangles, self.twin, turns, border)
         self.n_patches = int(self.patch.max()) + 1
         lower, upper = vertices[triangles].min(axis=(0, 1)), vertices[triangles].max(axis=(0, 1))
@@ -307,6 +329,10 @@ class Solid(Domain):
         arguments = _from_parts(read_parts(path, SOLIDS), unit)
         first, *others = [path] if isinstance(path, str | PathLike) else path
         name = f"solid {str(first)!r}" + (f" with {len(others)} more files" if others else "")
+        if others and options.get("wrap") is not None:
+            names = options.get("names") or {}
+            left = set(arguments["group_names"]) - set(_kept_groups(name, names, tuple(arguments["group_names"])))
+            options["names"] = {**{group: group for group in arguments["group_names"] if group in left}, **names}
         return cls(**{**arguments, "name": name, **options})
 
     @classmethod
@@ -859,6 +885,20 @@ def _from_parts(parts: list[FilePart], unit: float) -> dict[str, Any]:
     names = list(dict.fromkeys(words))
     groups = np.array([names.index(w) for w in words])[part]
     return arguments | {"groups": groups, "group_names": names}
+
+
+def _kept_groups(name: str, names: object, groups: tuple[str, ...]) -> list[str]:
+    """Return the groups that the names of boundaries mention."""
+    parts = names.values() if isinstance(names, Mapping) else ()
+    walls = [wall for part in parts for wall in (part if isinstance(part, list | tuple) else [part])]
+    kept = list(dict.fromkeys(wall for wall in walls if isinstance(wall, str)))
+    unknown = [wall for wall in kept if wall not in (*groups, "wall")]
+    if unknown:
+        raise InputError(
+            f"{name} names has {unknown[0]!r}, expected a group, {', '.join(groups)}, or wall, which a wrap has "
+            "for all groups that names does not mention"
+        )
+    return [wall for wall in kept if wall in groups and len(groups) > 1]
 
 
 def _areas(corners: np.ndarray) -> np.ndarray:

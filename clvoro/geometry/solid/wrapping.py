@@ -1,23 +1,26 @@
-"""Wrap triangles that bound no region, or have details finer than cells: a closed surface a little outside of them.
+"""Wrap triangles that bound no region, or have details finer than cells: a closed surface a little away from them.
 
 The distance from the triangles is sampled on a grid. Places farther than `reach` from them that are connected with the
-border of the grid are outside, and a surface bounds these. A second surface lies `reach` - `off` inside of the first,
-so that it is `off` outside of the triangles where no ball of the radius `reach` is kept from touching them. It closes
-holes and gaps up to 2 `reach` wide, and makes plates of sheets. Source of the two steps: closing of sets, Serra (1982),
-Image Analysis and Mathematical Morphology.
+border of the grid, or with a point inside, are the space around them, and a surface bounds it. A second surface lies
+`reach` - `off` outside of that space, so that it is `off` away from the triangles where no ball of the radius `reach`
+is kept from touching them. It closes holes and gaps up to 2 `reach` wide, and makes plates of sheets. Source of the two
+steps: closing of sets, Serra (1982), Image Analysis and Mathematical Morphology.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from numbers import Real
 
 import numpy as np
 import scipy
 
+from ...arguments import format_point
 from ...errors import InputError
 from ..surface import Surface
-from .combining import library
+from .combining import boolean, library
+from .creases import connect, pair_sides
 
 _OFF = 0.5
 """Distance of the closed surface from the triangles, over `reach`."""
@@ -29,42 +32,87 @@ _BLOCK = 8
 """Distances are computed in cubic blocks of the grid near the triangles: grid points along the edge of one."""
 _MOST = 50_000_000
 """Most points of a grid."""
+_SNAP = 0.25
+"""A vertex moves onto the border of a group if that is nearer to it along an edge than this share of the edge."""
+_FACING = 0.5
+"""How much nearer a triangle is that faces a point."""
+_SMOOTHINGS = 3
+"""How often vertices at borders of groups move halfway to the middle between those beside them."""
+_ISLAND = 2.0
+"""Parts of groups with less area than that of a square with edges this times `reach` go to what is around them."""
+_BISECTIONS = 10
+"""How often the width of a leak is halved."""
 
 
-def wrapped(surface: Surface, reach: float) -> tuple[Surface, str]:
-    """Return a closed surface around all triangles, and what was done.
+def wrapped(
+    surface: Surface, reach: float, inside: Sequence[float] | None, groups: np.ndarray
+) -> tuple[Surface, np.ndarray, str]:
+    """Return a closed surface around all triangles, its groups, and what was done.
+
+    Parameters
+    ----------
+    surface : Surface
+    reach : float
+    inside : three numbers, optional
+        A point: return the surface of the space around it in place of that around all triangles.
+    groups : (t,) int
+        Each place of the wrap has the group of the nearest triangle.
 
     Raises
     ------
     InputError
-        If `reach` is no length, longer than the surface, or so small that the grid would have too many points.
+        If `reach` is no length, longer than the surface, or so small that the grid would have too many points, or
+        `inside` is no point in a space that triangles close off up to gaps 2 `reach` wide.
     MissingLibraryError
         If manifold3d is not installed.
     """
     if isinstance(reach, bool) or not (isinstance(reach, Real) and 0 < reach < math.inf):
         raise InputError(f"{surface.name} wrap is {reach!r}, expected a length")
-    reach, longest = float(reach), float(np.ptp(surface.vertices, axis=0).max())
+    middle = (surface.vertices.min(axis=0) + surface.vertices.max(axis=0)) / 2
+    near = Surface(surface.vertices - middle, surface.triangles, surface.name)  # round-off as at the origin
+    reach, longest = float(reach), float(np.ptp(near.vertices, axis=0).max())
     if reach > longest:
         raise InputError(
             f"{surface.name} wrap is {reach:g}, longer than the surface, {longest:g}; give it in the unit of the "
             "solid, which is meters with `units`"
         )
     step = reach / _STEP
-    low = surface.vertices.min(axis=0) - reach - 3 * step
-    shape = np.ceil((surface.vertices.max(axis=0) + reach + 3 * step - low) / step) + 1
+    low = near.vertices.min(axis=0) - reach - 3 * step
+    shape = np.ceil((near.vertices.max(axis=0) + reach + 3 * step - low) / step) + 1
     if (count := math.prod(shape.tolist())) > _MOST:
         least = reach * (count / _MOST) ** (1 / 3)
         raise InputError(
             f"{surface.name} wrap is {reach:g}, which is too small for its extent; use {least:.2g} or more"
         )
     grid = _Sampled(low, step, shape.astype(int))
-    away = grid.distance(surface, 2 * reach)
+    away = grid.distance(near, 2 * reach)
     part = scipy.ndimage.label(away > reach)[0]
-    outer = part == part[0, 0, 0]
-    first = grid.level(surface.name, np.where(outer, reach - away, np.abs(away - reach)))
-    depth = np.where(outer, 0, grid.distance(first, 2 * reach, ~outer))
-    made = grid.level(surface.name, depth - (1 - _OFF) * reach)
-    return made, f"wrapped, at most {_distance(surface, made.vertices, math.inf).max():.3g} away from what was given"
+    sign, at = -1, (0, 0, 0)
+    if inside is not None:
+        sign, at = 1, grid.place(f"{surface.name} inside", inside, middle)
+        if not part[at]:
+            raise InputError(
+                f"{surface.name} inside is {format_point(inside)}, {away[at]:.3g} from the surface, expected a point "
+                f"farther from it than wrap, {reach:g}"
+            )
+        if part[at] == part[0, 0, 0]:
+            where, width = grid.leak(away > reach, at)
+            where = np.clip(where, near.vertices.min(axis=0), near.vertices.max(axis=0))
+            raise InputError(
+                f"{surface.name} inside is {format_point(inside)}, from where a gap {width:.3g} wide leads out at "
+                f"{format_point(middle + where)}, expected a space that is closed but for gaps up to 2 wrap, "
+                f"{2 * reach:g}; close it, or pass repair=True, which closes flat holes"
+            )
+    space = part == part[at]
+    first = grid.level(surface.name, sign * np.where(space, away - reach, -np.abs(away - reach)))
+    depth = np.where(space, 0, grid.distance(first, 2 * reach, ~space))
+    made, group = _with_groups(grid.level(surface.name, sign * ((1 - _OFF) * reach - depth)), near, groups, reach)
+    parts = (made.vertices, made.triangles, group, [str(k) for k in range(int(groups.max()) + 1)])
+    made = boolean("+", parts, simpler=_SIMPLER * step)
+    off = _distance(near, made["vertices"], math.inf).max()
+    group = made["groups"]
+    made = Surface(made["vertices"] + middle, made["triangles"], surface.name)
+    return made, group, f"wrapped, at most {off:.3g} away from what was given"
 
 
 class _Sampled:
@@ -87,6 +135,52 @@ class _Sampled:
         found[near] = _distance(surface, self.low + self.step * np.argwhere(near), reach)
         return found
 
+    def place(self, what: str, point: Sequence[float], origin: np.ndarray) -> tuple[int, ...]:
+        """Return the indices of the grid point nearest to a point that is given with another origin."""
+        x = np.array(point, float) if np.shape(point) == (3,) else np.full(3, math.nan)
+        at = np.rint((x - origin - self.low) / self.step)
+        if not ((at >= 0) & (at < self.shape)).all():
+            low, high = (format_point(origin + self.low + k * self.step * self.shape) for k in (0, 1))
+            raise InputError(f"{what} is {point!r}, expected a point, three numbers, from {low} to {high}")
+        return tuple(at.astype(int).tolist())
+
+    def leak(self, free: np.ndarray, at: tuple[int, ...]) -> tuple[np.ndarray, float]:
+        """Return the place (3,) and the width of the widest way from a grid point to the border of the grid.
+
+        Balls of growing radii are kept from passing it, until the point has no way any more.
+        """
+        room = scipy.ndimage.distance_transform_edt(free)
+        while True:  # to the middle of the space around the point
+            block = tuple(slice(max(k - 1, 0), k + 2) for k in at)
+            best = np.unravel_index(room[block].argmax(), room[block].shape)
+            ahead = tuple(part.start + int(k) for part, k in zip(block, best, strict=True))
+            if not room[ahead] > room[at]:
+                break
+            at = ahead
+        edge = np.ones(room.shape, bool)
+        edge[1:-1, 1:-1, 1:-1] = False
+        low, high = 0.0, float(room[at])
+        for _ in range(_BISECTIONS):
+            radius = (low + high) / 2
+            label = scipy.ndimage.label(room > radius)[0]
+            if (label[edge] == label[at]).any():
+                low = radius
+            else:
+                high = radius
+        label = scipy.ndimage.label(room > low)[0]
+        passage = label == label[at]
+        label = scipy.ndimage.label(room > high)[0]
+        beyond = np.isin(label, np.unique(label[edge & passage])[1:]) & passage | edge & passage
+        here = (label == label[at]) & (label > 0)
+        here[at] = True
+        narrow = scipy.ndimage.label(passage & ~beyond & ~here)[0]
+        near = scipy.ndimage.binary_dilation(here)
+        gate = np.isin(narrow, np.unique(narrow[near & (narrow > 0)])) & (narrow > 0)
+        gate &= scipy.ndimage.binary_dilation(beyond)
+        found = np.argwhere(gate)
+        place = found[0] if len(found) else np.array(at)
+        return self.low + self.step * place, 2 * self.step * (low + _STEP)
+
     def level(self, name: str, values: np.ndarray) -> Surface:
         """Return the surface where `values` on the grid are 0, around those above.
 
@@ -104,9 +198,117 @@ class _Sampled:
         manifold.level_set(note, bounds, _EDGE * self.step)
         x = (np.array(places) - self.low) / self.step
         found = dict(zip(places, scipy.ndimage.map_coordinates(values, x.T, order=1).tolist(), strict=True))
-        mesh = manifold.level_set(lambda *x: found[x], bounds, _EDGE * self.step)
-        mesh = mesh.simplify(_SIMPLER * self.step).to_mesh64()
+        mesh = manifold.level_set(lambda *x: found[x], bounds, _EDGE * self.step).to_mesh64()
         return Surface(np.array(mesh.vert_properties)[:, :3], np.array(mesh.tri_verts, np.int64), name)
+
+
+def _with_groups(made: Surface, given: Surface, groups: np.ndarray, reach: float) -> tuple[Surface, np.ndarray]:
+    """Return a surface with edges where it is as near to one group of a given surface as to the others, and its groups.
+
+    Parameters
+    ----------
+    groups : (t,) int
+        Groups of the triangles of `given`.
+    """
+    vertices, triangles = made.vertices.copy(), made.triangles
+    group = np.zeros(len(triangles), np.int64)
+    for number in range(1, int(groups.max()) + 1):
+        mine = groups == number
+        of, rest = (Surface(given.vertices, given.triangles[part]) for part in (mine, ~mine))
+        nearer = _away(rest, vertices, 2 * reach) - _away(of, vertices, 2 * reach)
+        ends = np.sort(np.stack([triangles, np.roll(triangles, -1, axis=1)], axis=2).reshape(-1, 2), axis=1)
+        a, b = np.unique(ends, axis=0).T
+        cut = nearer[a] * nearer[b] < 0
+        a, b = np.where((np.abs(nearer[a]) < np.abs(nearer[b]))[cut], (a[cut], b[cut]), (b[cut], a[cut]))
+        share = nearer[a] / (nearer[a] - nearer[b])
+        for k in np.argsort(share, kind="stable").tolist():
+            if share[k] < _SNAP and nearer[a[k]] * nearer[b[k]] < 0:
+                vertices[a[k]] += share[k] * (vertices[b[k]] - vertices[a[k]])
+                nearer[a[k]] = 0
+        vertices, triangles, nearer, parent = _split(vertices, triangles, nearer)
+        group = group[parent]
+        group[(group == 0) & (nearer[triangles].sum(axis=1) > 0)] = number
+    group = _without_islands(Surface(vertices, triangles), group, (_ISLAND * reach) ** 2)
+    side, twin = np.arange(3 * len(triangles)), pair_sides(vertices, triangles)[0]
+    side = side[group[side // 3] != group[twin // 3]]
+    a, b = triangles[side // 3, side % 3], triangles[side // 3, (side + 1) % 3]  # each edge in both directions
+    inner = np.bincount(a, minlength=len(vertices)) == 2
+    for _ in range(_SMOOTHINGS):
+        around = np.column_stack([np.bincount(a, vertices[b, k], len(vertices)) for k in range(3)])
+        vertices[inner] = (vertices[inner] + around[inner] / 2) / 2
+    return Surface(vertices, triangles), group
+
+
+def _split(
+    vertices: np.ndarray, triangles: np.ndarray, values: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Divide triangles where linear values at vertices change their sign.
+
+    Returns
+    -------
+    vertices, triangles, values : arrays
+    parent : (t,) int
+        The triangle that each one is a part of.
+    """
+    ends = np.sort(np.stack([triangles, np.roll(triangles, -1, axis=1)], axis=2).reshape(-1, 2), axis=1)
+    edges, edge = np.unique(ends, axis=0, return_inverse=True)
+    edge = edge.reshape(-1, 3)
+    a, b = edges.T
+    cut = values[a] * values[b] < 0
+    middle = np.where(cut, len(vertices) + np.cumsum(cut) - 1, -1)
+    a, b = a[cut], b[cut]
+    share = (values[a] / (values[a] - values[b]))[:, None]
+    vertices = np.concatenate([vertices, vertices[a] + share * (vertices[b] - vertices[a])])
+    values = np.concatenate([values, np.zeros(len(a))])
+    count = cut[edge].sum(axis=1)
+    made, parent = [triangles[count == 0]], [np.flatnonzero(count == 0)]
+    # The first side is the one that is cut, or the one that is not.
+    for number, wanted in ((1, True), (2, False)):
+        rows = np.flatnonzero(count == number)
+        turn = (np.arange(3) + (cut[edge[rows]] == wanted).argmax(axis=1)[:, None]) % 3
+        i, j, k = np.take_along_axis(triangles[rows], turn, axis=1).T
+        ij, jk, ki = middle[np.take_along_axis(edge[rows], turn, axis=1)].T
+        parts = [(i, ij, k), (ij, j, k)] if wanted else [(i, j, jk), (i, jk, ki), (jk, k, ki)]
+        made += [np.column_stack(part) for part in parts]
+        parent += len(parts) * [rows]
+    return vertices, np.concatenate(made), values, np.concatenate(parent)
+
+
+def _without_islands(surface: Surface, group: np.ndarray, least: float) -> np.ndarray:
+    """Return groups (t,) of which connected parts with less area than `least` have that of the longest border."""
+    group, corners = group.copy(), surface.corners
+    areas = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    length = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2).reshape(-1)
+    side = np.arange(len(length))
+    here, there = side // 3, pair_sides(surface.vertices, surface.triangles)[0] // 3
+    while True:
+        same = group[here] == group[there]
+        count, part = connect(len(group), np.column_stack([here, there])[same])
+        area = np.bincount(part, areas, count)
+        beside = scipy.sparse.coo_array(
+            (length[~same], (part[here[~same]], part[there[~same]])), (count, count)
+        ).tocsr()
+        smallest = next((p for p in np.argsort(area) if area[p] < least and beside[[p]].nnz), None)
+        if smallest is None:
+            return group
+        other = beside[[smallest]].toarray().argmax()
+        group[part == smallest] = group[np.flatnonzero(part == other)[0]]
+
+
+def _away(surface: Surface, points: np.ndarray, reach: float) -> np.ndarray:
+    """Return how far `points` (n, 3) are from a surface, up to `reach`, (n,): less where it faces them.
+
+    So the surface that faces them is the nearer one where two have the same nearest point, on their common edge.
+    """
+    from .solid import NearestTriangles
+
+    feet = NearestTriangles(surface, np.arange(len(surface))).feet(points, reach)
+    a, b, c = np.moveaxis(surface.corners[feet.triangle], 1, 0)
+    normal = np.cross(b - a, c - a)
+    normal /= np.maximum(np.linalg.norm(normal, axis=1), 1e-300)[:, None]
+    return np.minimum(feet.distance, reach) - _FACING * np.abs(
+        np.einsum("nd,nd->n", points - feet.point, normal) * (feet.triangle >= 0)
+    )
 
 
 def _distance(surface: Surface, points: np.ndarray, reach: float) -> np.ndarray:

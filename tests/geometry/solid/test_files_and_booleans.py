@@ -192,6 +192,22 @@ def test_a_wrap_is_closed_around_all_triangles(vertices, triangles, wrap, volume
     assert solid.boundary_distance(given).min() > 0.06
 
 
+SIX = {"groups": np.arange(12) // 2, "group_names": list("abcdef")}
+
+
+@pytest.mark.parametrize(
+    ("inside", "shift", "chains", "corners", "volume"),
+    [(None, 0, 2, 0, 1.65), ((1e7 + 0.5, 1e7 + 0.5, 1e7 + 0.5), 1e7, 12, 8, 0.455)],
+)
+def test_a_wrap_keeps_the_groups_that_names_mention(inside, shift, chains, corners, volume):
+    names = {"inlet": "a", "outlet": "b"} if inside is None else {"inlet": "a", **{name: name for name in "bcdef"}}
+    with pytest.warns(MismatchWarning, match="wrapped"):
+        solid = Solid(V + shift, T, **SIX, wrap=0.2, names=names, inside=inside)
+    assert solid.boundary_names == (*names, *(["wall"] if inside is None else []))
+    assert (solid.creases.n_chains, len(solid.corners), solid.n_patches) == (chains, corners, len(solid.boundary_names))
+    assert solid.measure == pytest.approx(volume, rel=0.05)
+
+
 def test_vertices_within_round_off_are_one():
     assert Solid(*with_gap(1e-15)).measure == pytest.approx(1)
 
@@ -216,11 +232,16 @@ def test_edges_sharper_than_ten_degrees_are_warned_of():
         ({"wrap": 1e-20}, "too small for its extent"),
         ({"wrap": 20}, "wrap is 20, longer than the surface, 1; .* unit"),
         ({"wrap": 0.2, "creases": [(0, 1)]}, "creases and wrap"),
+        ({"wrap": 0.2, "names": {"inlet": "c"}}, "names has 'c', expected a group, wall"),
+        ({"inside": (0, 0, 0)}, "inside without wrap"),
+        ({"wrap": 0.2, "inside": (0.5, 0.5, 0.03)}, "from the surface, expected a point farther"),
+        ({"wrap": 0.2, "inside": (0.5, 2)}, "expected a point, three numbers"),
+        ({"wrap": 0.2, "inside": (0.5, 0.5, 0.5), "triangles": T[2:]}, r"gap 1.07 wide leads out at \(0, 0\.4"),
     ],
 )
 def test_wrong_options_are_refused(options, says):
     with pytest.raises(InputError, match=says):
-        Solid(V, T, **options)
+        Solid(**{"vertices": V, "triangles": T, **options})
 
 
 def test_creases_can_be_drawn_on_a_flat_wall():
