@@ -14,7 +14,7 @@ import shapely
 from ..errors import InputError, InputTypeError
 from ..geometry import curves
 from ..geometry.bvh import Tree
-from ..geometry.domain import Domain
+from ..geometry.domain import LARGEST_EDGE, Domain
 from ..geometry.lines.lines import Lines
 from ..geometry.shapes import Circle, Edges, Polyline, Segment, shapes_of
 from ..geometry.surface import Surface
@@ -113,6 +113,11 @@ class Distance(Field):
         self.dim = dims.pop()
         parts = parts or [(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))]
         self._begin, self._end, self._radius = (np.concatenate(p) for p in zip(*parts, strict=True))
+        far = max(float(np.abs(x).max(initial=0)) for x in (self._begin, self._end, self._radius))
+        if far > LARGEST_EDGE:
+            raise InputError(
+                f"{name} got a shape with the length {far:g}, expected at most {LARGEST_EDGE:g}; correct it"
+            )
 
     def landmarks(self, domain: Domain) -> np.ndarray:
         """Return points on the shapes, about 1/64 of the domain's shorter side apart."""

@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 CORNER = math.radians(30)
 """Turns of more than this are corners, not curves."""
+_MOST = 1e9
+"""Most cells across a gap."""
 
 
 def radii_of_curvature(domain: Polygon) -> np.ndarray:
@@ -121,6 +123,8 @@ class FeatureSize(Field):
             raise InputTypeError(f"FeatureSize domain is a {type(domain).__name__}, expected a clvoro.Polygon")
         self.domain, longest = domain, float(domain.extent.max())
         self.cells_across = check_positive("FeatureSize cells_across", cells_across)
+        if self.cells_across > _MOST:
+            raise InputError(f"FeatureSize cells_across is {cells_across!r}, expected at most {_MOST:g}")
         self.slope = check_slope("FeatureSize", 1.2 if growth is None and slope is None else growth, slope)
         if self.slope == 0:
             raise InputError("FeatureSize got no growth, expected growth above 1 or slope above 0")

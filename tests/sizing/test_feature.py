@@ -190,6 +190,7 @@ def test_device_and_host_agree(ctx, dtype: str) -> None:
     [
         ({"domain": clvoro.Box((0, 0), (1, 1))}, "domain is a Box, expected a clvoro.Polygon"),
         ({"cells_across": 0}, "cells_across is 0"),
+        ({"cells_across": 1e300}, "at most 1e"),
         ({"growth": 1}, "no growth"),
         ({"growth": 1.2, "slope": 0.1}, "exactly one"),
         ({"h_min": -1}, "h_min is -1"),

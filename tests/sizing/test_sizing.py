@@ -322,6 +322,8 @@ def test_distance_to_geometries_of_shapely():
         assert sizing.Distance(shapes, 1, slope=0.5)(points) == pytest.approx(expected, rel=1e-12)
     with pytest.raises(InputError, match="not empty"):
         sizing.Distance(shapely.Polygon(), 1, slope=0.5)
+    with pytest.raises(InputError, match=r"length 1e\+160, expected at most"):
+        sizing.Distance(shapely.Point(0, 1e160), 1, slope=0.5)
 
 
 def test_growth_is_the_ratio_of_neighboring_cells():
