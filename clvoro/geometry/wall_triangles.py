@@ -19,10 +19,11 @@ if TYPE_CHECKING:
 
 SMOOTH, CONVEX, CONCAVE = 0, 1, 2
 """Kinds of edges and corners of triangles: within a patch, on a convex crease, on a concave one."""
-SAGITTA, SAGITTA_SLOPE = 0.245, 0.7
-"""Depth of wall polygons, whose vertices lie on the surface, below a surface of mean curvature H, over H h^2: half the
-mean square of the vertices' distance from the foot, which is 0.19 of the area of hexagons. Wall faces are larger than
-h^2, and the more so the more convex the wall is: the factor is 1 + SAGITTA_SLOPE H h. Measured in and around balls."""
+SAGITTA, SAGITTA_SLOPE = 0.1, 0.7
+"""Depth of wall polygons below the foot of the generator on a surface of mean curvature H, over H h^2, where they cut
+off as much as they add: half the mean square distance from the foot, which is 0.08 of the area of hexagons. Wall faces
+are larger than h^2, and the more so the more convex the wall is: the factor is 1 + SAGITTA_SLOPE H h. Measured in and
+around balls."""
 TIP_COSINE, TIP_STEPS, TIP_BEND = math.cos(math.radians(30)), 6, 0.4
 """A patch has a tip, as that of a cone, where the cosine between its mean normal and that of a triangle is less. The
 long triangles there are halved so often towards the tip, and mean curvature times h counts as at most TIP_BEND."""

@@ -156,7 +156,7 @@ class _LayeredWalls:
         vector = self.faces.vectors[1][self.rows][self.face]
         normal = sum_rows(pair, vector, len(keys))
         normal /= np.maximum(np.linalg.norm(normal, axis=1), 1e-300)[:, None]
-        self.pair_vertex, self.pair_patch = keys // p, keys % p
+        self.pair_vertex, self.pair_patch, self.pair_normal = keys // p, keys % p, normal
         first = np.searchsorted(self.pair_vertex, np.arange(u + 1))
         self.n_patches = np.diff(first)
         normals, wanted = np.zeros((u, self.n_patches.max(), 3)), np.zeros((u, self.n_patches.max()))
@@ -200,18 +200,25 @@ class _LayeredWalls:
         self.way[np.concatenate([begin[alone], end[alone]])] = 0
 
     def _onto_patches(self, rows: np.ndarray, places: np.ndarray, bare: bool = False) -> np.ndarray:
-        """Return `places` (k, 3) of the vertices `rows` (k,), on their patches; `bare`: on those without layers."""
+        """Return `places` (k, 3) of the vertices `rows` (k,), as far from their patches as the vertices are.
+
+        `bare`: only from those without layers.
+        """
         place = np.full(len(self.vertices), -1)
         place[rows] = np.arange(len(rows))
         mine = place[self.pair_vertex] >= 0
         if bare:
             mine &= self.count[self.pair_patch] == 0
-        row, patch = place[self.pair_vertex[mine]], self.pair_patch[mine]
-        found = places.copy()
+        row, patch, normal = place[self.pair_vertex[mine]], self.pair_patch[mine], self.pair_normal[mine]
+        found, off = places.copy(), np.empty((len(row), 3))
+        patches = [(p, np.flatnonzero(patch == p)) for p in np.unique(patch).tolist()]
+        for p, k in patches:
+            x = self.faces.points[self.vertices[rows[row[k]]]]
+            high = ((x - self.solid.feet_on_patch(p, x)) * normal[k]).sum(axis=1)
+            off[k] = high[:, None] * normal[k]
         for _ in range(3):  # by turns, where there are several
-            for p in np.unique(patch).tolist():
-                some = row[patch == p]
-                found[some] = self.solid.feet_on_patch(p, found[some])
+            for p, k in patches:
+                found[row[k]] = self.solid.feet_on_patch(p, found[row[k]]) + off[k]
         return found
 
     @cached_property

@@ -16,6 +16,7 @@ from ...mesh.diagram import Diagram
 from ...mesh.faces import Faces
 from ..collapse import collapse_short
 from ..moves import FEW, MOVES, at_generators, least_bad, moved
+from .balance import balanced, unbalanced
 from .chains import Crossings, cross_cells
 from .cures import Cures, cured
 from .mend import at_wall, changed_cells, narrow_faces, rejected_at_walls, touching_walls, with_neighbors
@@ -314,8 +315,12 @@ def _finished(
     near, home, own, cures = raw.near, raw.home, raw.own, None
     tell("short edges at walls")
     faces, changed = _collapsed(raw.faces, near.sizes[home])
+    chords, faces = faces, balanced(surface, faces)
     tell("checks of cells at walls")
     rejected = rejected_at_walls(faces, changed | touching_walls(faces))
+    if len(rejected) and faces is not chords:
+        faces = unbalanced(faces, chords, rejected)
+        rejected = rejected_at_walls(faces, changed | touching_walls(faces))
     if len(rejected):  # where a face has been collapsed, another small one may bulge out
         suspect = np.zeros(faces.n_cells, bool)
         suspect[rejected] = True

@@ -19,6 +19,8 @@ SNAP_CREASE = 0.06
 """Wall vertices this close to a crease, as a share of h, are moved onto it."""
 SNAP_CORNER = 0.12
 """The same for corners."""
+_FLAT = 1e-9
+"""A patch is flat if its mean normal is shorter than 1 by less than this."""
 
 
 class WallSurface:
@@ -54,9 +56,23 @@ class WallSurface:
         area = np.bincount(self.patch, self.solid.surface.areas, self.n_patches) * self.solid.extent.max() ** 2
         return 2 * area / np.maximum(around, 1e-300)
 
+    @cached_property
+    def bent(self) -> np.ndarray:
+        """Whether the triangles of each patch are in more than one plane, (p,) bool."""
+        area = self.solid.surface.areas
+        normal = [np.bincount(self.patch, area * x, self.n_patches) for x in self.solid.normals.T]
+        return np.linalg.norm(normal, axis=0) < (1 - _FLAT) * np.bincount(self.patch, area, self.n_patches)
+
     def closest(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the closest triangle (k,), the point on it (k, 3), and the distance (k,), negative inside."""
-        return self.solid.closest(points, None if self._nearest is None else self._nearest(points, np.inf))
+        return self.solid.closest(points, self._triangles(points))
+
+    def feet(self, points: np.ndarray) -> np.ndarray:
+        """Return the closest point of the surface to each of `points` (k, 3), (k, 3)."""
+        return self.solid.feet(points, triangles=self._triangles(points)).point
+
+    def _triangles(self, points: np.ndarray) -> np.ndarray | None:
+        return None if self._nearest is None else self._nearest(points, np.inf)
 
     def touches(self, points: np.ndarray, reach: np.ndarray) -> np.ndarray:
         """Return for each of `points` (k, 3) whether the surface may lie within `reach` (k,)."""

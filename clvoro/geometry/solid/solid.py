@@ -482,18 +482,25 @@ class Solid(Domain):
         """All triangles, for nearest points."""
         return NearestTriangles(self.surface, np.arange(len(self.patch)))
 
-    def feet(self, points: np.ndarray, reach: float = math.inf) -> Feet:
-        """Return the nearest point of the surface to each of `points` (n, 3), within `reach`."""
-        return self._whole.feet(np.asarray(points, float), reach)
+    def feet(self, points: np.ndarray, reach: float = math.inf, triangles: np.ndarray | None = None) -> Feet:
+        """Return the nearest point of the surface to each of `points` (n, 3), within `reach`.
+
+        `triangles` (n,) are the nearest ones, if they are known.
+        """
+        return (
+            self._whole.feet(np.asarray(points, float), reach)
+            if triangles is None
+            else self._whole.feet_on(points, triangles)
+        )
 
     def closest(
         self, points: np.ndarray, triangles: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return triangle (n,) int, foot (n, 3) and distance (n,), negative inside, of `points` (n, 3).
 
-        `triangles` (n,) are the nearest ones, if they are known.
+        `triangles`: see `feet`.
         """
-        feet = self.feet(points) if triangles is None else self._whole.feet_on(points, triangles)
+        feet = self.feet(points, triangles=triangles)
         return feet.triangle, feet.point, np.where(self.covers(points), -1, 1) * feet.distance
 
     def signed_distance(self, points: np.ndarray) -> np.ndarray:
@@ -503,6 +510,14 @@ class Solid(Domain):
     def boundary_distance(self, points: np.ndarray) -> np.ndarray:
         """Return the distance of each of `points` (n, 3) to the surface, inside and outside; (n,)."""
         return self.feet(check_rows("points", points, 3)).distance
+
+    def heights_over(self, points: np.ndarray, starts: np.ndarray, corners: np.ndarray) -> np.ndarray:
+        """Return how high the surface is curved over polygons; see `Domain.heights_over`."""
+        foot, counts = self.feet(points[corners]).point, np.diff(starts)
+        middle = self.feet(np.add.reduceat(foot, starts[:-1]) / counts[:, None])
+        away = foot - np.repeat(middle.point, counts, axis=0)
+        height = np.abs((away * np.repeat(self.normals[middle.triangle], counts, axis=0)).sum(axis=1))
+        return np.maximum.reduceat(height, starts[:-1])
 
     def nearest(self, points: np.ndarray) -> np.ndarray:
         """Return the nearest point of the solid to each of `points` (n, 3)."""

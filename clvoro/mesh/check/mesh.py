@@ -161,6 +161,8 @@ def _check_sum(check: Check, owner: np.ndarray, areas: np.ndarray, width: np.nda
     )
 
 
+SAGITTAS = 2
+"""Largest distance of a wall vertex from the surface, over the heights of the surface over its polygons."""
 MOVED = 0.4
 """Largest difference between the distances from an inner vertex of a solid to its generators, over the cell's size.
 
@@ -375,11 +377,12 @@ def _check_geometry(check: Check, g: Rebuilt) -> None:
 
 
 def check_solid(check: Check, g: Rebuilt) -> None:
-    """Check a mesh with moved vertices: measures are those of its corners, and corners of faces on surfaces lie there.
+    """Check a mesh with moved vertices: measures are those of its corners, and wall polygons follow the surface.
 
-    Wall polygons are chords of a curved surface: what the cells lack of the solid, or have beyond it, lies between the
-    polygons and the surface. Inside, vertices are equidistant from the generators around them up to what merging and
-    the surface have moved them, `MOVED` of the size of a cell.
+    Wall polygons are chords of a curved surface, and their corners no farther from it than `SAGITTAS`: what the cells
+    lack of the solid, or have beyond it, lies between the polygons and the surface. Inside, vertices are
+    equidistant from the generators around them up to what merging and the surface have moved them, `MOVED` of the size
+    of a cell.
     """
     d, slack = check.diagram, ROUNDINGS * g.unit
     faces, domain = d.faces, d.domain
@@ -394,11 +397,15 @@ def check_solid(check: Check, g: Rebuilt) -> None:
     corners = np.unique(faces.corners[wall:])
     # Faces towards cells that `subset` removed are not on the surface.
     on_surface = ~domain.removed_behind(-1 - faces.neighbor[faces.n_inner :])
-    held = np.unique(faces.corners[wall:][np.repeat(on_surface, np.diff(faces.starts[faces.n_inner :]))])
+    counts = np.diff(faces.starts[faces.n_inner :])
+    held = np.unique(faces.corners[wall:][np.repeat(on_surface, counts)])
+    heights = domain.uncut.heights_over(d.vertices, faces.starts[faces.n_inner :] - wall, faces.corners[wall:])
+    deepest = np.zeros(len(d.vertices))
+    np.maximum.at(deepest, faces.corners[wall:], np.repeat(np.where(on_surface, heights, 0), counts))
     away = domain.uncut.boundary_distance(d.vertices[held])
     check.note(
         "walls",
-        np.maximum(away - 1e3 * slack, 0),
+        np.maximum(away - 1e3 * slack - SAGITTAS * deepest[held], 0),
         lambda k: f"vertex {held[k]} of a face on a wall is off the surface by {away[k]:.3g}",
     )
     center, area = faces.center[faces.n_inner :], faces.area[faces.n_inner :]
