@@ -127,12 +127,17 @@ def _escape_bars(app, what, name, obj, options, lines):
 
 
 _OF_DOMAINS = {name for kind in Domain.__mro__ for name in vars(kind)} - FOR_CALLERS
-_INTERNAL = """default_color framed_by watched Diagram.demand_cells Diagram.demand_voronoi Diagram.has_moved_vertices
-Diagram.with_arrays Faces.compact Faces.take_faces Faces.take_vectors Faces.with_half_faces Polygon.crossings
+_INTERNAL = """check_dim default_color framed_by items map_parts projected watched Curve.nodes Diagram.demand_cells
+Diagram.demand_voronoi Diagram.has_moved_vertices Diagram.with_arrays Faces.compact Faces.far Faces.images Faces.near
+Faces.side_ends Faces.take_faces Faces.take_vectors Faces.with_half_faces Measures.line Polygon.crossings
 Polygon.digest Polygon.edge_ends Polygon.edges_within Polygon.find_edges Polygon.geometry Polygon.is_slit
-projected Run.call_parts Run.conclude Run.fixed_count Run.note Run.record Solid.clearance Solid.closest
-Solid.corner_kinds Solid.corner_normals Solid.curvature Solid.feet_on_patch Solid.shell_volumes Solid.shells
-Solid.side_kinds Solid.widths""".split()
+Run.call_parts Run.conclude Run.fixed_count Run.note Run.record Solid.clearance Solid.closest Solid.corner_kinds
+Solid.corner_normals Solid.curvature Solid.feet_on_patch Solid.shell_volumes Solid.shells Solid.side_kinds
+Solid.widths SolverMeasures.bad_tetrahedra_of SolverMeasures.cells SolverMeasures.concave_pairs
+SolverMeasures.coupled SolverMeasures.edge_of_corner SolverMeasures.edge_spans SolverMeasures.edges
+SolverMeasures.face_cells SolverMeasures.geometry SolverMeasures.line Surface.areas Surface.check Surface.columns
+Surface.crossings Surface.distance2 Surface.open_sides Surface.packed Surface.places Surface.require_closed
+Surface.rows Surface.tree""".split()
 
 
 def _leave_out(app, what, name, obj, skip, options):

@@ -41,6 +41,15 @@ def rows(page):
     return [[cell.strip(" |") for cell in line] for line in lines]
 
 
+def test_members_that_the_reference_leaves_out_exist():
+    given = re.search(r'_INTERNAL = """(.*?)"""', (DOCS / "conf.py").read_text(), re.DOTALL)[1].split()
+    source = "".join(path.read_text() for path in Path(clvoro.__file__).parent.rglob("*.py"))
+    for name in given:
+        *kinds, member = name.split(".")
+        assert all(re.search(rf"^class {kind}\b", source, re.MULTILINE) for kind in kinds), name
+        assert re.search(rf"^    (def )?{member}\b", source, re.MULTILINE), name
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("page", [p for p in OWN if blocks(p, "python")])
 def test_python_on_pages_runs(page, tmp_path, monkeypatch):

@@ -338,7 +338,7 @@ class InsertionDeletion:
 
     def _apply(self, present: Present, marks: _Marks) -> Outcome | None:
         """Carry out the marked changes."""
-        engine, t, generators = self.engine, present.t, present.generators
+        engine, t = self.engine, present.t
         totals = self._room("totals", size=2, dtype=np.int32)
         for place, counts in enumerate((marks.kept, marks.born)):
             self._scan.exclusive(counts, counts, t.n, total=(totals, place))
@@ -357,7 +357,7 @@ class InsertionDeletion:
             engine.empty(m),
         )
         changes = marks.kept, marks.born, np.int32(first), np.int32(present.fixed), *present.domain.device_args(engine)
-        before = t.points, *list(vars(generators).values())[1:], marks.shifts, marks.births
+        before = *vars(present.generators).values(), marks.shifts, marks.births
         mesh = *t.graph, t.face_centroids, *t.outlines
         engine.run_each(self._kernels.apply_changes, t.n, *changes, *before, *vars(new).values(), *mesh)
         return Outcome(new, inserted, deleted)
