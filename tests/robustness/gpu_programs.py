@@ -41,6 +41,8 @@ TARGETS = {
     "generic": ["-target", "spir64", "-cl-std=CL2.0", "-emit-llvm", "-Wno-constant-logical-operand"],
 }
 CLANG = ["-x", "cl", "-cl-std=CL1.2", "-Xclang", "-finclude-default-header", "-Xclang", "-fdeclare-opencl-builtins"]
+PATIENCE = 900
+"""Seconds after which a compiler counts as one that hangs."""
 LIBRARIES = ("/usr/lib/clc", "/usr/lib/llvm-*/share/clc", "/usr/share/clc")
 """Folders of the built-in functions in LLVM's bitcode (Debian's packages libclc-*)."""
 FIRST_CAPACITIES = {
@@ -153,7 +155,7 @@ def compile_for(target: str, source: Source, folder: Path, *more: str, optimize:
     given, made = folder / f"{stem}.cl", folder / f"{stem}.s"
     given.write_text(source.text)
     flags = [clang() or "clang", *CLANG, optimize, "-Wall", "-Wno-unused", *TARGETS[target], *source.options, *more]
-    done = subprocess.run([*flags, "-S", "-o", made, given], capture_output=True, text=True)
+    done = subprocess.run([*flags, "-S", "-o", made, given], capture_output=True, text=True, timeout=PATIENCE)
     assert done.returncode == 0 or done.stderr
     text = made.read_text() if made.exists() else ""
     for path in (given, made):
@@ -229,7 +231,10 @@ def nvidia_figures(source: Source, folder: Path, arch: str = "sm_90") -> dict[st
     stem = folder / f"{abs(hash(ptx)):x}.ptx"
     stem.write_text(ptx)
     done = subprocess.run(
-        ["ptxas", "-v", f"-arch={arch}", "-o", stem.with_suffix(".cubin"), stem], capture_output=True, text=True
+        ["ptxas", "-v", f"-arch={arch}", "-o", stem.with_suffix(".cubin"), stem],
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE,
     )
     for path in (stem, stem.with_suffix(".cubin")):
         path.unlink(missing_ok=True)

@@ -31,6 +31,8 @@ from clvoro.opencl import program as _program
 from tests.robustness.oclgrind_work import buffers_of_their_own
 
 HERE = Path(__file__).parent
+PATIENCE = 900
+"""Seconds after which a program that is built or repeated counts as one that hangs."""
 SANITIZERS = {
     "memory": ["-fsanitize=memory", "-fsanitize-memory-track-origins", "-DMEMORY_SANITIZER"],
     "address": [
@@ -226,7 +228,7 @@ def build(program: Program, sanitizer: str, folder: Path) -> Path:
 
 
 def call(command, text: str = "") -> None:
-    done = subprocess.run(command, input=text, text=True, capture_output=True)
+    done = subprocess.run(command, input=text, text=True, capture_output=True, timeout=PATIENCE)
     if done.returncode:
         raise RuntimeError(f"{' '.join(map(str, command))}\n{done.stderr[:4000]}")
 
@@ -250,9 +252,8 @@ def repeat(program: Program, sanitizer: str, folder: Path) -> tuple[list[Outcome
     """Repeat the launches of `program`; return their outcomes, and what the sanitizer says."""
     if not program.jobs:
         return [], ""
-    done = subprocess.run(
-        [build(program, sanitizer, folder), *program.jobs], capture_output=True, text=True, errors="replace"
-    )
+    command = [build(program, sanitizer, folder), *program.jobs]
+    done = subprocess.run(command, capture_output=True, text=True, errors="replace", timeout=PATIENCE)
     outcomes = []
     for line in done.stdout.splitlines():
         path, differing, difference, absolute, unwritten = line.rsplit(" ", 4)
