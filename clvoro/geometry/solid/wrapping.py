@@ -104,7 +104,7 @@ def wrapped(
                 f"{2 * reach:g}; close it, or pass repair=True, which closes flat holes"
             )
     space = part == part[at]
-    first = grid.level(surface.name, sign * np.where(space, away - reach, -np.abs(away - reach)))
+    first = grid.level(surface.name, sign * np.where(space, away - reach, -np.abs(away - reach)), _SIMPLER)
     depth = np.where(space, 0, grid.distance(first, 2 * reach, ~space))
     made, group = _with_groups(grid.level(surface.name, sign * ((1 - _OFF) * reach - depth)), near, groups, reach)
     parts = (made.vertices, made.triangles, group, [str(k) for k in range(int(groups.max()) + 1)])
@@ -181,7 +181,7 @@ class _Sampled:
         place = found[0] if len(found) else np.array(at)
         return self.low + self.step * place, 2 * self.step * (low + _STEP)
 
-    def level(self, name: str, values: np.ndarray) -> Surface:
+    def level(self, name: str, values: np.ndarray, simpler: float = 0.0) -> Surface:
         """Return the surface where `values` on the grid are 0, around those above.
 
         The library asks for one place after the other: first for all places, whose values are computed together.
@@ -198,7 +198,8 @@ class _Sampled:
         manifold.level_set(note, bounds, _EDGE * self.step)
         x = (np.array(places) - self.low) / self.step
         found = dict(zip(places, scipy.ndimage.map_coordinates(values, x.T, order=1).tolist(), strict=True))
-        mesh = manifold.level_set(lambda *x: found[x], bounds, _EDGE * self.step).to_mesh64()
+        made = manifold.level_set(lambda *x: found[x], bounds, _EDGE * self.step)
+        mesh = (made.simplify(simpler * self.step) if simpler else made).to_mesh64()
         return Surface(np.array(mesh.vert_properties)[:, :3], np.array(mesh.tri_verts, np.int64), name)
 
 
