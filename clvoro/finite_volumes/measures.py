@@ -42,10 +42,8 @@ class SolverMeasures:
     def cells(self) -> Faces:
         """The cells as polyhedra: in 2D prisms.
 
-        Raises
-        ------
-        InputError
-            In 2D for a cell around an island or one that touches itself, as a face of OpenFOAM has no hole.
+        Raises `InputError` in 2D for a cell around an island or one that touches itself, as a face of OpenFOAM has no
+        hole.
         """
         return polyhedra(self.mesh, self.thickness)
 
@@ -216,12 +214,11 @@ class SolverMeasures:
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the pairs of faces with a cosine above `limit`, see `defects.concave_pairs`, of the cells `judged`.
 
-        Returns
-        -------
-        faces : (2, p) int
-        cells : (p,) int
-        sine : (p,) float
-            How far the center of the second face is beyond the plane of the first, over the distance of the centers.
+        Results:
+        - `faces`: (2, p) int
+        - `cells`: (p,) int
+        - `sine` (p,) float: how far the center of the second face is beyond the plane of the first, over the distance
+          of the centers.
         """
         cell, face, sign = self.face_cells
         places = self.cells.cell_faces()[1]

@@ -202,10 +202,7 @@ class Surface:
     def require_closed(self) -> None:
         """Raise if the surface is not closed.
 
-        Raises
-        ------
-        InputError
-            With the number of open edges, and the place of the first one.
+        Raises `InputError` with the number of open edges, and the place of the first one.
         """
         if self.closed:
             return
@@ -247,10 +244,7 @@ class Surface:
     def check(self) -> None:
         """Raise if the surface intersects itself.
 
-        Raises
-        ------
-        InputError
-            With the first pair of triangles, their places and the number of pairs.
+        Raises `InputError` with the first pair of triangles, their places and the number of pairs.
         """
         pairs = self.crossings()
         if len(pairs):

@@ -59,25 +59,14 @@ Option = tuple[Gain, Edits, list[int]]
 class Cures:
     """Tries cures on the rejected cells of a mesh.
 
-    Parameters
-    ----------
-    surface : WallSurface
-    faces : Faces
-    names : (n,) int
-        The generator of each cell. Two meshes share a cell only if its name is the same in both.
-    sizes : (n,) float
-        h of the cells.
-    earlier : Cures, optional
-        Those of an earlier mesh. They are repeated in cells that both meshes share.
+    - `names` (n,) int: the generator of each cell. Two meshes share a cell only if its name is the same in both.
+    - `sizes` (n,) float: h of the cells.
+    - `earlier`: those of an earlier mesh. They are repeated in cells that both meshes share.
 
-    Attributes
-    ----------
-    edits : Edits
-        The mesh with all changes that are kept.
-    searches : int
-        How often cures have been tried on a cell, also by the earlier cures.
-    most : int
-        The number of searches after which no cure is tried.
+    Its attributes:
+    - `edits`: the mesh with all changes that are kept.
+    - `searches`: how often cures have been tried on a cell, also by the earlier cures.
+    - `most`: the number of searches after which no cure is tried.
     """
 
     def __init__(

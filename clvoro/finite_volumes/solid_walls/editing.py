@@ -28,20 +28,12 @@ Edge = tuple[int, int]
 class Edits:
     """A mesh in 3D with some faces, cells and points changed.
 
-    Parameters
-    ----------
-    mesh : Faces
-    parent : Edits, optional
-        Changes on top of which these come.
+    - `parent`: changes on top of which these come.
 
-    Attributes
-    ----------
-    touched : set of int
-        Cells whose faces, or whose points, have changed, also those that are gone.
-    origins : dict of int
-        The cell of `mesh` of which each new cell is a part.
-    taken : list of Edits
-        Trials that have become a part of these edits, in turn.
+    Its attributes:
+    - `touched`: cells whose faces, or whose points, have changed, also those that are gone.
+    - `origins`: the cell of `mesh` of which each new cell is a part.
+    - `taken`: trials that have become a part of these edits, in turn.
     """
 
     def __init__(self, mesh: Faces, parent: Edits | None = None) -> None:
@@ -255,17 +247,10 @@ class Edits:
     def repeat(self, other: Edits, matches: Matches) -> dict[int, int]:
         """Repeat the changes that other edits have made to their mesh, in the cells that both meshes share.
 
-        Parameters
-        ----------
-        other : Edits
-            Those of another mesh of the same solid.
-        matches : Matches
-            Between that mesh and this one. It gets the new faces and vertices as well.
+        - `other`: those of another mesh of the same solid.
+        - `matches`: between that mesh and this one. It gets the new faces and vertices as well.
 
-        Returns
-        -------
-        dict of int
-            Of each cell of the other mesh whose changes have all been repeated: its number in this mesh.
+        Return for each cell of the other mesh whose changes have all been repeated its number in this mesh.
         """
         cells, faces, points = dict[int, int](), matches.faces, matches.points
         different = set[int]()
@@ -346,17 +331,11 @@ class Edits:
 class Matches:
     """Cells of two meshes that are the same up to rounding. Each is searched for once.
 
-    Parameters
-    ----------
-    one, other : Edits
-        All changes are ignored.
-    names_of_one, names_of_other : (n,) int
-        Cells with one name may be the same.
+    - `one`, `other`: all changes are ignored.
+    - `names_of_one`, `names_of_other` (n,) int: cells with one name may be the same.
 
-    Attributes
-    ----------
-    cells, faces, points : dict of int
-        Numbers in the other mesh.
+    Its attributes:
+    - `cells`, `faces`, `points`: numbers in the other mesh.
     """
 
     def __init__(self, one: Edits, names_of_one: np.ndarray, other: Edits, names_of_other: np.ndarray) -> None:
@@ -430,11 +409,9 @@ def between(loop: tuple[int, ...], begin: int, end: int) -> tuple[int, ...]:
 def judge(trials: list[tuple[Edits, list[int]]]) -> list[tuple[np.ndarray, np.ndarray]]:
     """Judge some cells of each trial by the criteria of OpenFOAM, all together, as cells of one mesh.
 
-    Returns
-    -------
-    list of (excess, worst)
-        The excess of each cell, (k,) float: by how much limits are exceeded, summed over all its faces and pairs of
-        faces; above 0 if OpenFOAM rejects it. And the worst of its measures over their limits, (k,) float.
+    The result is a list of (excess, worst): the excess of each cell, (k,) float: by how much limits are exceeded, summed
+    over all its faces and pairs of faces; above 0 if OpenFOAM rejects it. And the worst of its measures over their
+    limits, (k,) float.
     """
     owner, neighbor, loops, points = [], [], [], []
     judged: list[int] = []

@@ -63,11 +63,7 @@ class Feet:
 class NearestTriangles:
     """Some triangles of a surface, to find the nearest points on them.
 
-    Parameters
-    ----------
-    surface : Surface
-    items : (m,) int
-        The triangles.
+    - `items` (m,) int: the triangles.
     """
 
     def __init__(self, surface: Surface, items: np.ndarray):
@@ -103,10 +99,8 @@ class NearestTriangles:
 def _samples(triangles: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return points (k, 3) on a surface, and their triangles (k,): the vertices, and a grid in each large triangle.
 
-    Parameters
-    ----------
-    triangles : (t, 3) int
-    corners : (t, 3, 3) float
+    - `triangles`: (t, 3) int
+    - `corners`: (t, 3, 3) float
     """
     _, first = np.unique(triangles, return_index=True)
     points, item = [corners.reshape(-1, 3)[first]], [first // 3]
