@@ -37,6 +37,7 @@ from clvoro.opencl import memory_limits
 from clvoro.opencl.engine import Engine
 from clvoro.opencl.peers import Peers
 from clvoro.opencl.threads import Team
+from clvoro.tessellation.part_steps import PartSteps
 from clvoro.tessellation.stages import UPDATES
 
 ARRAYS = (
@@ -165,9 +166,25 @@ def test_the_diagram_has_the_same_bits_in_any_number_of_parts(ctx, dim, dtype, k
 
 @pytest.mark.parametrize("kind", ["plane", "space", "polygon"])
 def test_steps_have_the_same_bits_in_any_number_of_parts(ctx, kind, monkeypatch):
-    """Generators move by Lloyd's algorithm, in boxes across a seam. Cells are made anew at first, and updated later."""
+    """Generators move by Lloyd's algorithm, in boxes across a seam. Cells are made anew at first, and updated later.
+
+    No ball in which a part claims to know all generators meets the way of another one, also where limits are mended.
+    """
     dim = 3 if kind == "space" else 2
-    updated, update = [], UPDATES[dim].update
+    updated, update, finish = [], UPDATES[dim].update, PartSteps._finished
+
+    def proved(steps, part, t):
+        found = finish(steps, part, t)
+        if found is not None and part.ghosts is not None:
+            x, labels, ways = steps._balls.centers, part.labels.get()[: part.count], len(steps._shifts)
+            known = labels * ways + np.concatenate([np.full(len(x), ways // 2), steps._sides % ways])
+            own = np.column_stack([labels[: len(x)], x, steps._limits[:, 1]])
+            every = np.concatenate(steps.peers.exchange([own] * steps.peers.count))
+            for way, shift in enumerate(steps._shifts):
+                others = every[~np.isin(every[:, 0] * ways + way, known), 1:]
+                away = np.linalg.norm(x[:, None] - others[:, :dim] - shift, axis=2)
+                assert (away > steps._limits[:, :1] + others[:, dim] - 1e-9).all()
+        return found
 
     def noted(stage, *given, **more):
         found = update(stage, *given, **more)
@@ -175,6 +192,8 @@ def test_steps_have_the_same_bits_in_any_number_of_parts(ctx, kind, monkeypatch)
         return found
 
     monkeypatch.setattr(UPDATES[dim], "update", noted)
+    if kind == "plane":
+        monkeypatch.setattr(PartSteps, "_finished", proved)
     box = clvoro.Box((0,) * dim, (6, *[1] * (dim - 1)), periodic=(True, *[False] * (dim - 1)))
     x = np.random.default_rng(70102).random((800, dim)) * box.extent
     if kind == "polygon":
