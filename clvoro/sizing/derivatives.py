@@ -180,16 +180,8 @@ class Derivatives:
         """Return gradients (n, k, d) and Hessians (n, k, d, d) of `values` (n, k), with lengths in `unit`."""
         engine, d, (n, width) = self.engine, self.engine.dim, values.shape
         gradients, hessians = engine.empty((n, width, d)), engine.empty((n, width, d, d))
-        engine.run_each(
-            self._kernels.fit_quadratics,
-            n,
-            engine.upload(stencils.starts, np.int32),
-            engine.upload(stencils.neighbors, np.int32),
-            engine.upload(stencils.across / unit),
-            engine.upload(stencils.mesh.centroids / unit),
-            np.int32(width),
-            engine.upload(values),
-            gradients,
-            hessians,
-        )
+        lists = engine.upload(stencils.starts, np.int32), engine.upload(stencils.neighbors, np.int32)
+        places = engine.upload(stencils.across / unit), engine.upload(stencils.mesh.centroids / unit)
+        found = np.int32(width), engine.upload(values), gradients, hessians
+        engine.run_each(self._kernels.fit_quadratics, n, *lists, *places, *found)
         return gradients.get().astype(float), hessians.get().astype(float)

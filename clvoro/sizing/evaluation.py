@@ -141,16 +141,8 @@ class Sizing:
             h_out[:n].set(h.astype(self.engine.real))
             grad_out[:n].set(gradient.astype(self.engine.real))
             return
-        self.engine.run_each(
-            self._kernels.evaluate_size_gradient,
-            n,
-            points,
-            self.data,
-            *self.domain.device_args(self.engine),
-            h_out,
-            grad_out,
-            self._invalid,
-        )
+        given = points, self.data, *self.domain.device_args(self.engine)
+        self.engine.run_each(self._kernels.evaluate_size_gradient, n, *given, h_out, grad_out, self._invalid)
 
     @property
     def invalid_index(self) -> cla.Array | None:

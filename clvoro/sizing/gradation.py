@@ -71,19 +71,8 @@ class Gradation:
                 growth = engine.real.type(slope)
                 front = [engine.real.type(begin + (1 + k // 2) * rise) for k in range(_PASSES)]
             for k in range(_PASSES):
-                engine.run_each(
-                    kernels.sweep_tiles,
-                    n,
-                    *nodes,
-                    *steps,
-                    np.int32(k % 2),
-                    growth,
-                    front[k],
-                    active,
-                    next_active,
-                    lowest,
-                    values,
-                )
+                given = *nodes, *steps, np.int32(k % 2), growth, front[k]
+                engine.run_each(kernels.sweep_tiles, n, *given, active, next_active, lowest, values)
                 active.fill(np.int32(0))
                 active, next_active = next_active, active
             passes += _PASSES

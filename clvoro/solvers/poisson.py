@@ -166,19 +166,10 @@ class Poisson:
         store = np.dtype(np.float32) if tolerance >= SINGLE_PRECISION_TOLERANCE else engine.real
         weights = engine.scratch(len(neighbors), store)
         weights.fill(0)
-        engine.run(
-            self._kernels_in(store, face_measures.dtype).assemble_laplacian,
-            n,
-            np.int32(n),
-            np.int32(density is not None),
-            starts,
-            neighbors,
-            face_measures,
-            points,
-            points if density is None else density,
-            weights,
-            *self.engine.period_args,
-        )
+        kernel = self._kernels_in(store, face_measures.dtype).assemble_laplacian
+        faces = starts, neighbors, face_measures, points, points if density is None else density
+        given = np.int32(n), np.int32(density is not None), *faces, weights, *engine.period_args
+        engine.run(kernel, n, *given)
         return Laplacian(starts, neighbors, weights, None if part is None or part.peers is None else part)
 
     def inverse_diagonal(self, laplacian: Laplacian) -> cla.Array:
