@@ -409,8 +409,8 @@ def between(loop: tuple[int, ...], begin: int, end: int) -> tuple[int, ...]:
 def judge(trials: list[tuple[Edits, list[int]]]) -> list[tuple[np.ndarray, np.ndarray]]:
     """Judge some cells of each trial by the criteria of OpenFOAM, all together, as cells of one mesh.
 
-    The result is a list of (excess, worst): by how much limits are exceeded, summed over all faces and pairs of faces of
-    a cell, above 0 if OpenFOAM rejects it, (k,) float; and the worst of its measures over their limits, (k,) float.
+    The result is a list of (excess, worst): by how much limits are exceeded, summed over all faces and pairs of faces
+    of a cell, above 0 if OpenFOAM rejects it, (k,) float; and the worst of its measures over their limits, (k,) float.
     """
     owner, neighbor, loops, points = [], [], [], []
     judged: list[int] = []
