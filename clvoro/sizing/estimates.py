@@ -236,12 +236,13 @@ def estimate(
     The sizes are those of `best_sizes`, which also takes the `bounds`: `n_cells`, `eps`, `h_min` and `h_max`. They are
     smoothed in `smoothed` passes after their growth is limited, so that a peak of the indicator stays narrow. What is
     promised holds afterwards: growth is limited again, and sizes are scaled where the error exceeds `eps`. Before, gaps
-    of the indicator that are less than two cells wide are filled: a mesh cannot follow them.
+    of the indicator less than two cells wide, which a mesh cannot follow, are filled up to a half of what is around.
     """
     slope = check_slope(what, growth, None)
     stencils = CellStencils.of(on)
     places = _places(stencils, slope, smoothed)
-    filled = stencils.bounds(stencils.bounds(indicator)[1])[0] if smoothed else indicator
+    around = stencils.bounds(stencils.bounds(indicator)[1])[0] if smoothed else indicator
+    filled = np.maximum(indicator, around / 2)
     sizes = best_sizes(what, filled, places, order=order, p=p, constant=constant, **bounds)
     made = Estimate(stencils.mesh, sizes, constant * indicator * sizes**order, order, p)
     eps = bounds["eps"]
