@@ -192,6 +192,7 @@ def test_a_wrap_is_closed_around_all_triangles(vertices, triangles, wrap, volume
     assert solid.boundary_distance(given).min() > 0.06
 
 
+COPY = {"groups": np.arange(13) // 12, "group_names": ["a", "b"]}
 SIX = {"groups": np.arange(12) // 2, "group_names": list("abcdef")}
 
 
@@ -237,6 +238,7 @@ def test_edges_sharper_than_ten_degrees_are_warned_of():
         ({"wrap": 0.2, "inside": (0.5, 0.5, 0.03)}, "from the surface, expected a point farther"),
         ({"wrap": 0.2, "inside": (0.5, 2)}, "expected a point, three numbers"),
         ({"wrap": 0.2, "inside": (0.5, 0.5, 0.5), "triangles": T[2:]}, r"gap 1.07 wide leads out at \(0, 0\.4"),
+        ({"wrap": 0.2, "triangles": [*T, T[0]], "names": {"b": "b"}} | COPY, "no place for 'b'"),
     ],
 )
 def test_wrong_options_are_refused(options, says):
