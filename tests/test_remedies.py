@@ -128,6 +128,11 @@ def north(points):
     return points[:, -1] > 0
 
 
+def nested():
+    """A tetrahedron in a larger one."""
+    return np.concatenate([CORNERS, 0.1 * CORNERS + 0.2]), [*TRIANGLES, *(np.array(TRIANGLES) + 4)]
+
+
 def two(scale, away=0.1, turned=False):
     """Return vertices and triangles of a tetrahedron, and of another one in it or across it."""
     more = np.array(TRIANGLES) + 4
@@ -920,6 +925,14 @@ ROWS = [
     (
         lambda t: clvoro.Solid(np.concatenate([CORNERS, CORNERS + 5]), [*TRIANGLES, *(TURNED + 4)]),
         lambda t: clvoro.Solid(np.concatenate([CORNERS, CORNERS + 5]), [*TRIANGLES, *(TURNED + 4)], repair=True),
+    ),
+    (
+        lambda t: clvoro.Solid(CORNERS, TRIANGLES[1:], wrap=0.1, inside=(0.2, 0.2, 0.2)),
+        lambda t: clvoro.Solid(CORNERS, TRIANGLES[1:], wrap=0.1, inside=(0.2, 0.2, 0.2), repair=True),
+    ),
+    (
+        lambda t: clvoro.Solid(*nested(), [0] * 4 + [1] * 4, ["a", "b"], wrap=0.1, names={"x": "b"}),
+        lambda t: clvoro.Solid(*nested(), [0] * 4 + [1] * 4, ["a", "b"], wrap=0.1),
     ),
     (
         lambda t: sizing.Surface(*two(1, away=0.3)).check(),

@@ -122,6 +122,8 @@ def warn_of_errors(result: Result) -> None:
             "cells beside layers of prisms make room for them, and are too large where these are thinner than given: "
             "use thinner layers"
         )
+    elif not made > 0:
+        why = "that cell has no volume, as walls there are nearer to each other than cells are wide: use smaller sizes"
     elif steep and any(diagram.shifts[slice(*diagram.neighbor_starts[i : i + 2])].any() for i in near):
         why = (
             "sizes jump at a seam of the periodic box: a field must have the period of the box; repeat its shapes one "

@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 _DASHES = ("-", "--", ":", "-.")  # for more names than colors
 _PARTS = 64  # Pieces of triangles are smaller than this part of the domain's longest edge.
 _HUES = np.array([to_rgb(color) for color in METHOD_COLORS])
+_LABEL_ROOM = 0.04
+"""Least distance of two numbers, over the extent."""
 _LABEL: Any = {
     "ha": "center",
     "va": "center",
@@ -101,7 +103,7 @@ def _plot_in_space(domain: Domain, numbers: bool) -> Any:
     areas = np.linalg.norm(normals, axis=1) / 2
     normals /= np.maximum(2 * areas, 1e-300)[:, None]
     outwards = -1 if fills_box(domain, pieces, areas) else 1
-    hues = (wall if numbers else domain.boundary_index[wall]) % len(METHOD_COLORS)
+    hues = (_hues(domain)[wall] if numbers else domain.boundary_index[wall]) % len(METHOD_COLORS)
     figure = interactive_figure(WIDTH, WIDTH / 2)
     hidden = set(walls.tolist())
     for ax, angles in zip(figure.subplots(1, 2), (VIEW, (VIEW[0] + 180, -VIEW[1])), strict=True):
@@ -114,15 +116,30 @@ def _plot_in_space(domain: Domain, numbers: bool) -> Any:
         colors = (0.4 + 0.6 * _HUES[hues[shown]]) * brightness(outwards * normals[shown], angles)[:, None]
         drawn = PolyCollection(list(flat[shown]), facecolors=colors, edgecolors=colors, linewidths=0.3, rasterized=True)
         ax.add_collection(drawn, autolim=False)
+        placed = np.zeros((0, 2))
         for k, place in _places(flat[shown], wall[shown], domain).items() if numbers else ():
-            ax.annotate(str(k), place, **_LABEL)
-            hidden.discard(k)
+            if (np.linalg.norm(placed - place, axis=1) > _LABEL_ROOM * domain.extent.max()).all():
+                ax.annotate(str(k), place, **_LABEL)
+                placed = np.vstack([placed, place])
+                hidden.discard(k)
     if not numbers:
         names = [Patch(color=_HUES[k % len(_HUES)], label=name) for k, name in enumerate(domain.boundary_names)]
         figure.legend(handles=names, loc="outside lower center", ncols=4, frameon=False)
     elif hidden:
-        figure.supxlabel(f"hidden: {', '.join(map(str, sorted(hidden)))}", fontsize=8)
+        figure.supxlabel(f"without a number: {', '.join(map(str, sorted(hidden)))}", fontsize=8)
     return figure
+
+
+def _hues(domain: Domain) -> np.ndarray:
+    """Return a color for each wall, (k,) int: of those that no earlier wall beside it has, the one used least."""
+    hues, pairs = np.zeros(len(domain.boundary_index), int), np.asarray(domain.meeting_walls)
+    used = np.zeros(len(METHOD_COLORS))
+    for k in range(len(hues)):
+        beside = np.unique(pairs[(pairs == k).any(axis=1)])
+        taken = np.bincount(hues[beside[beside < k]], minlength=len(used)) > 0
+        hues[k] = (used + len(hues) * taken).argmin()
+        used[hues[k]] += 1
+    return hues
 
 
 def _pieces(corners: np.ndarray, wall: np.ndarray, domain: Domain) -> tuple[np.ndarray, np.ndarray]:

@@ -258,7 +258,11 @@ def test_plots_show_the_names(meshed) -> None:
 @pytest.mark.parametrize(
     ("domain", "seen", "hidden"),
     [
-        (lambda: clvoro.Solid.ball((0, 0, 0), 1, 0.2) - clvoro.Solid.ball((0, 0, 0), 0.5, 0.2), [0], "hidden: 1"),
+        (
+            lambda: clvoro.Solid.ball((0, 0, 0), 1, 0.2) - clvoro.Solid.ball((0, 0, 0), 0.5, 0.2),
+            [0],
+            "without a number: 1",
+        ),
         (
             lambda: clvoro.Solid.outside(clvoro.Solid.box((1, 1, 1), (2, 2, 2)), clvoro.Box((0,) * 3, (3,) * 3)),
             range(12),

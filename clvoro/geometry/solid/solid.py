@@ -385,7 +385,7 @@ class Solid(Domain):
         """Return a box; its sides have the names xMin, xMax, yMin, ..."""
         from .primitives import box
 
-        return cls(**{**box(lower, upper), **options})
+        return cls(**_with_options(box(lower, upper), options))
 
     @classmethod
     def cone(
@@ -394,7 +394,7 @@ class Solid(Domain):
         """Return a cone from its base around `begin` to its tip `end`, with the boundaries bottom and side."""
         from .primitives import cone
 
-        return cls(**{**cone(begin, end, radius, edge), **options})
+        return cls(**_with_options(cone(begin, end, radius, edge), options))
 
     @classmethod
     def torus(
@@ -403,7 +403,7 @@ class Solid(Domain):
         """Return a torus around an axis in z: a tube of the radius `tube` around a circle of `radius`."""
         from .primitives import torus
 
-        return cls(**{**torus(center, radius, tube, edge), **options})
+        return cls(**_with_options(torus(center, radius, tube, edge), options))
 
     @classmethod
     def turned(cls, profile: Sequence[Sequence[float]], edge: float | None = None, **options: Any) -> Solid:
@@ -413,14 +413,14 @@ class Solid(Domain):
         """
         from .primitives import turned
 
-        return cls(**{**turned(profile, edge), **options})
+        return cls(**_with_options(turned(profile, edge), options))
 
     @classmethod
     def extruded(cls, polygon: Polygon, bottom: float, top: float, **options: Any) -> Solid:
         """Return a `Polygon`, with its holes, between two heights; its boundaries, and those named bottom and top."""
         from .primitives import extruded
 
-        return cls(**{**extruded(polygon, bottom, top), **options})
+        return cls(**_with_options(extruded(polygon, bottom, top), options))
 
     @classmethod
     def polyhedron(cls, normals: object, offsets: object, **options: Any) -> Solid:
@@ -430,14 +430,14 @@ class Solid(Domain):
         """
         from .primitives import polyhedron
 
-        return cls(**{**polyhedron(normals, offsets), **options})
+        return cls(**_with_options(polyhedron(normals, offsets), options))
 
     @classmethod
     def ball(cls, center: Sequence[float], radius: float, edge: float | None = None, **options: Any) -> Solid:
         """Return a ball. `edge` is the length of the triangles' edges; by default a sixteenth of the radius."""
         from .primitives import ball
 
-        return cls(**{**ball(center, radius, edge), **options})
+        return cls(**_with_options(ball(center, radius, edge), options))
 
     @classmethod
     def cylinder(
@@ -446,7 +446,7 @@ class Solid(Domain):
         """Return a cylinder around the axis from `begin` to `end`, with the boundaries side, bottom and top."""
         from .primitives import cylinder
 
-        return cls(**{**cylinder(begin, end, radius, edge), **options})
+        return cls(**_with_options(cylinder(begin, end, radius, edge), options))
 
     @property
     def meeting_walls(self) -> np.ndarray:
@@ -894,6 +894,12 @@ def _from_parts(parts: list[FilePart], unit: float) -> dict[str, Any]:
     names = list(dict.fromkeys(words))
     groups = np.array([names.index(w) for w in words])[part]
     return arguments | {"groups": groups, "group_names": names}
+
+
+def _with_options(made: dict[str, Any], options: dict[str, Any]) -> dict[str, Any]:
+    """Return the arguments of a simple solid with those of the caller; a single name is for the whole surface."""
+    single = len(options.get("group_names") or ()) == 1
+    return {**made, **({"groups": None} if single else {}), **options}
 
 
 def _kept_groups(name: str, names: object, groups: tuple[str, ...]) -> list[str]:
