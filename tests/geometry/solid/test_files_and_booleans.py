@@ -59,6 +59,7 @@ def test_a_step_file_is_read_in_meters(tmp_path):
 
 
 def test_the_outside_of_a_body_has_the_names_of_both():
+    assert Solid.box((0, 0, 0), (1, 1, 1), group_names=["body"]).boundary_names == ("body",)
     body = Solid.ball((0, 0, 0), 1, edge=0.3, group_names=("ball",))
     region = Solid.outside(body, Box((-2, -2, -2), (4, 2, 2), names={"inlet": "xMin"}))
     assert region.boundary_names == ("inlet", "xMax", "yMin", "yMax", "zMin", "zMax", "ball")
