@@ -1,6 +1,7 @@
 """Meshes of solids, and what OpenFOAM says: `checkMesh -allGeometry -allTopology` for CAD-like parts.
 
-    python bench/solids.py [--only NAMES] [--runs NAMES] [--seeds N] [--resolutions NUMBERS] [--booleans N]
+    python bench/solids.py [--only NAMES] [--runs NAMES] [--seeds N] [--resolutions NUMBERS] [--graded]
+                           [--booleans N]
                            [--files FOLDER] [--first N] [--cells N] [--limit SECONDS] [--speed NUMBERS]
                            [--domains NAMES] [--order SIZES]
                            [--layers THICKNESS:COUNT:GROWTH,...] [--surfaces] [--keep FOLDER]
@@ -44,7 +45,7 @@ import tempfile
 import time
 import traceback
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -154,8 +155,12 @@ def part_of(job: int | tuple[Path, bool], cells: int) -> tuple[clvoro.Solid, flo
     room = 0.6 * (upper - lower).max()
     air = clvoro.Solid.outside(solid, (lower - room, upper + room))
     h = (air.measure / cells) ** (1 / 3)
-    body = [air.boundary(name) for name in set(air.boundary_names) & set(solid.boundary_names)]
-    return air, h, clvoro.sizing.Distance(body, h_min=0.5 * h, growth=1.2, h_max=2 * h)
+    return air, h, growing(air, set(air.boundary_names) & set(solid.boundary_names), h)
+
+
+def growing(solid: clvoro.Solid, walls: Iterable[str], h: float) -> clvoro.sizing.Distance:
+    """Return sizes from h / 2 at the walls to 2 h away from them."""
+    return clvoro.sizing.Distance([solid.boundary(w) for w in walls], h_min=0.5 * h, growth=1.2, h_max=2 * h)
 
 
 def measure_boolean(adapter: clvoro.Adapter, job: int | tuple[Path, bool], cells: int) -> dict[str, Any]:
@@ -441,6 +446,7 @@ def main() -> None:
     options_of.add_argument("--runs", default="default", metavar="NAMES", help="efforts, and exact")
     options_of.add_argument("--seeds", type=int, default=0, metavar="N", help="one run with each of 1 to N")
     options_of.add_argument("--resolutions", default="0,1", metavar="NUMBERS", help="0: coarse, 1: fine")
+    options_of.add_argument("--graded", action="store_true", help="sizes from h / 2 at walls to 2 h")
     options_of.add_argument("--booleans", type=int, default=0, metavar="N", help="random solids in place of those")
     options_of.add_argument(
         "--files", type=Path, metavar="FOLDER", help="solids of all files below it in place of those"
@@ -503,7 +509,9 @@ def main() -> None:
                 with tempfile.TemporaryDirectory() as folder:
                     case = Path(folder) if options.keep is None else options.keep / label
                     try:
-                        row |= measure(adapter, solid_of(make(), repair=name == "dirty"), h, case, **settings, **seed)
+                        solid = solid_of(make(), repair=name == "dirty")
+                        size = growing(solid, solid.boundary_names, h) if options.graded else h
+                        row |= measure(adapter, solid, size, case, **settings, **seed)
                         if options.pictures is not None:
                             draw(row["result"], options.pictures / f"{label}.png", f"{name}, h = {h:g}")
                     except ClvoroError as error:

@@ -253,7 +253,7 @@ def test_a_cell_with_a_concave_crease_is_cut(ctx):
     x[np.linalg.norm(x - (1, 1, 0.5), axis=1) < H] += 0.25 * H * np.array([1, -0.6, 0.1])
     h = np.full(len(x), H)
     with pytest.warns(clvoro.errors.MismatchWarning, match="cells at .* are parts of others"):
-        d = solid_diagram(WallSurface(solid), x, h, lambda x: whole_faces(ctx, solid, x, h), centers=False)
+        d = solid_diagram(WallSurface(solid), x, h, lambda x: whole_faces(ctx, solid, x, h), straight=False)
     assert d.check("openfoam")
     assert d.check()
     assert d.volumes.sum() == pytest.approx(solid.measure, rel=1e-9)
@@ -415,12 +415,15 @@ def test_few_cells_in_thin_solids(ctx, seed):
         assert clvoro.Adapter(ctx).diagram(solid, inside).solver_mesh().n_cells <= 3
 
 
-@pytest.mark.parametrize("centers", [True, False])
-def test_generators_move_to_centroids_where_faces_are_oblique(ctx, centers):
+@pytest.mark.parametrize(("straight", "centerings"), [(True, 6), (True, 0), (False, 6)])
+def test_generators_move_to_centroids_where_faces_are_oblique(ctx, monkeypatch, straight, centerings):
+    """Without that faces turn or collapse."""
+    monkeypatch.setattr("clvoro.finite_volumes.solid_walls.mesh._CENTERINGS", centerings)
     solid = clvoro.Solid.box((0, 0, 0), (1, 1, 1))
     x, h = generators(solid), np.full(64, H)
     x[0] += 0.5 * H * np.array([1, -1, 1])
     whole = partial(whole_faces, ctx, solid, h=h)
-    d = solid_diagram(WallSurface(solid), x, h, whole, centers=centers)
-    assert (d.faces.measures.non_orthogonality.max() < 20) == centers
-    assert np.array_equal(d.points, x) == (not centers)
+    d = solid_diagram(WallSurface(solid), x, h, whole, straight=straight)
+    assert (d.faces.measures.non_orthogonality.max() < 20) == straight
+    assert np.array_equal(d.points, x) == (not straight or not centerings)
+    assert d.volumes.sum() == pytest.approx(1, rel=1e-9)

@@ -3,6 +3,8 @@
 A cell that is concave at an edge, as at a concave crease, is cut in two. Other cures collapse short edges and small
 faces, merge cells, and change or divide faces; the last ones leave out a part of the solid. All are tried on a rejected
 cell. The best one is kept if it leaves fewer cells rejected than before, or as many, but nearer to what is accepted.
+
+At the end faces that are oblique, between cells that OpenFOAM accepts, are turned or collapsed in the same way.
 """
 
 from __future__ import annotations
@@ -15,7 +17,7 @@ import numpy as np
 
 from ...mesh.faces import Faces
 from .cutting import CellCut, planes_through
-from .editing import Edge, Edits, Matches, area_of, between, edges_of, judge
+from .editing import REJECTED, WANTED_ANGLE, Edge, Edits, Matches, area_of, between, edges_of, judge
 from .mend import rejected_among, touching_walls, with_neighbors
 from .wall_surface import WallSurface
 
@@ -33,6 +35,8 @@ _SHORT = 0.25
 """Length over h below which edges may be collapsed, and faces whose corners are all that near to their mean."""
 _SMALL = 0.4
 """Cells with a smaller volume, over h^3, may be merged with a neighbor; new parts of cells always may."""
+_TURNS = (0.3, 0.6, 1.0)
+"""Shares of the angle by which oblique faces are turned."""
 _REACH = 0.3
 """Largest distance over h of a crease or corner onto which a vertex may be moved."""
 _SLIVER, _TIP, _FEW = 0.05, 0.4, 4
@@ -40,15 +44,16 @@ _SLIVER, _TIP, _FEW = 0.05, 0.4, 4
 others. So may up to `_FEW` cells without faces to others."""
 _TOO_MANY = 0.2
 """Share of rejected cells above which no cure is tried: the solid is as thin as a cell."""
-_BUDGET, _MOST = 12, 1000
+_BUDGET, _MOST, _MOST_OBLIQUE = 12, 1000, 300
 """Most changes of a rejected cell before others have their turn, and most searches for cures in meshes that are made
-one after another."""
+one after another, and at oblique faces at the end."""
 _EACH = 6
 """Most searches in one mesh over the number of its rejected cells: parts of a cell may be cut again and again."""
 _AHEAD = 1
 """Where no cure of a cell helps, cures of the cells that OpenFOAM rejects after it may follow: how many in turn."""
-_BRANCHES, _MOST_BAD = 2, 3
-"""After how many of the cures of a cell others are tried, and for how many rejected cells."""
+_BRANCHES, _MORE_BRANCHES, _MOST_BAD = 2, 6, 3
+"""After how many of the cures of a cell others are tried, of those with oblique faces that are left then, and for how
+many rejected cells."""
 
 Gain = tuple[int, float, float]
 """Change of the number of rejected cells, and of their excess; the worst measure after it. See `judge`."""
@@ -62,19 +67,27 @@ class Cures:
     - `names` (n,) int: the generator of each cell. Two meshes share a cell only if its name is the same in both.
     - `sizes` (n,) float: h of the cells.
     - `earlier`: those of an earlier mesh. They are repeated in cells that both meshes share.
+    - `strictly`: mend oblique and skewed faces, see `judge`; else rejected cells only.
 
     Its attributes:
     - `edits`: the mesh with all changes that are kept.
     - `searches`: how often cures have been tried on a cell, also by the earlier cures.
     - `most`: the number of searches after which no cure is tried.
+    - `branches`: after how many of the cures of a cell others are tried.
     """
 
     def __init__(
-        self, surface: WallSurface, faces: Faces, names: np.ndarray, sizes: np.ndarray, earlier: Cures | None = None
+        self,
+        surface: WallSurface,
+        faces: Faces,
+        names: np.ndarray,
+        sizes: np.ndarray,
+        earlier: Cures | None = None,
+        strictly: bool = False,
     ) -> None:
         self.surface, self.edits, self.names, self.sizes = surface, Edits(faces), names, sizes
         self.changes, self.searches, self.changed, self.tried = 0, 0, dict[int, int](), dict[int, int]()
-        self.most = _MOST
+        self.most, self.branches, self.strictly = _MOST_OBLIQUE if strictly else _MOST, _BRANCHES, strictly
         self.excess: dict[int, tuple[int, float]] = {}
         self.judged: dict[tuple[Edits, int, bool], list[Option]] = {}
         if earlier is not None:
@@ -111,7 +124,7 @@ class Cures:
         if self.excess[cell][1] == 0:
             return False
         self.judged = {}
-        for last in (False, True):
+        for last in (False,) if self.strictly else (False, True):
             self.searches += 1
             if (found := self._best(edits, cell, _AHEAD, last)) is not None:
                 edits.take(found[1])
@@ -126,7 +139,7 @@ class Cures:
         stamps = {c: self.stamp(c) for c in cells}
         new = [c for c, when in stamps.items() if self.excess.get(c, (-1, 0))[0] != when]
         if new:
-            found = judge([(self.edits, new)])[0][0].tolist()
+            found = judge([(self.edits, new)], self.strictly)[0][0].tolist()
             self.excess |= {c: (stamps[c], excess) for c, excess in zip(new, found, strict=True)}
 
     def stamp(self, cell: int) -> int:
@@ -147,7 +160,7 @@ class Cures:
             return gain, trial
         if not ahead:
             return None
-        for gain, trial, bad in sorted(options, key=lambda o: o[0][1])[:_BRANCHES]:
+        for gain, trial, bad in sorted(options, key=lambda o: o[0][1])[: self.branches]:
             for c in bad[:_MOST_BAD]:
                 if trial.faces_of(c) and (further := self._best(trial, c, ahead - 1, last)) is not None:
                     gain = (gain[0] + further[0][0], gain[1] + further[0][1], max(gain[2], further[0][2]))
@@ -160,6 +173,8 @@ class Cures:
         """Return all cures of a cell that leave cells closed. Each search judges them once."""
         if (edits, cell, last) not in self.judged:
             cures = [self.cuts, self.transfers, self.collapses, self.mergers, self.halves]
+            if self.strictly:
+                cures = [self.collapses, self.tilts, self.mergers]
             if last:
                 cures = [self.unions, self.losses]
             self.judged[edits, cell, last] = self._judged(edits, [t for cure in cures for t in cure(edits, cell)])
@@ -168,17 +183,18 @@ class Cures:
 
     def _judged(self, edits: Edits, trials: list[Edits]) -> list[Option]:
         """Return what those trials gain that leave cells closed."""
-        trials = [t for t in trials if all(t.is_sound(c) for c in t.touched if not t.is_vast(c))]
+        trials = [t for t in trials if all(t.is_sound(c) and not t.is_vast(c) for c in t.touched)]
         if not trials:
             return []
         around = edits.alive(set().union(*(t.touched for t in trials)))
         cells = [t.alive(t.touched) for t in trials]
-        (old, _), *verdicts = judge([(edits, around), *zip(trials, cells, strict=True)])
+        (old, _), *verdicts = judge([(edits, around), *zip(trials, cells, strict=True)], self.strictly)
         before = dict(zip(around, old.tolist(), strict=True))
         options = []
         for trial, mine, (excess, worst) in zip(trials, cells, verdicts, strict=True):
             known = [before.get(c, 0.0) for c in trial.touched]
-            fewer = int((excess > 0).sum()) - sum(e > 0 for e in known)
+            least = REJECTED - 1 if self.strictly else 0.0
+            fewer = int((excess > least).sum()) - sum(e > least for e in known)
             gain = (fewer, float(excess.sum()) - sum(known), float(worst.max(initial=0)))
             options.append((gain, trial, [c for c, e in zip(mine, excess.tolist(), strict=True) if e > 0]))
         return options
@@ -303,6 +319,27 @@ class Cures:
                     if _merge(trial, gone, left):
                         yield trial
 
+    def tilts(self, edits: Edits, cell: int) -> Iterator[Edits]:
+        """Turn an oblique face of a cell, about its center or a corner, towards the line through both centroids."""
+        for k in edits.faces_of(cell):
+            other, loop = edits.across(k, cell), edits.seen(k, cell)
+            if other < 0 or edits.is_vast(other):
+                continue
+            x = edits.positions(loop)
+            normal, line = area_of(x), self._center(edits, other) - self._center(edits, cell)
+            normal, line = normal / np.linalg.norm(normal), line / np.linalg.norm(line)
+            if normal @ line > math.cos(math.radians(WANTED_ANGLE)):
+                continue
+            walls = [edits.patches_at(cell, v) for v in loop]
+            for share, fixed in itertools.product(_TURNS, [x.mean(axis=0), *x]):
+                turned = normal + share * (line - normal)
+                moved = x + ((fixed - x) @ turned / (normal @ turned))[:, None] * normal
+                trial = edits.trial()
+                for v, patches, place in zip(loop, walls, moved, strict=True):
+                    if (target := self._placed(patches, place, self.h(edits, cell))) is not None:
+                        trial.move(cell, v, target)
+                yield trial
+
     def unions(self, edits: Edits, cell: int) -> Iterator[Edits]:
         """Join two wall polygons that meet at a concave edge; the ends of the edge stay, or are left out."""
         for _, edge, left, right, _ in self._concave_edges(edits, cell)[:_EDGES]:
@@ -362,6 +399,19 @@ class Cures:
     def _is_small(self, edits: Edits, cell: int) -> bool:
         """Return whether a cell may be merged with a neighbor."""
         return cell >= edits.mesh.n_cells or self._volume(edits, cell) < _SMALL * self.h(edits, cell) ** 3
+
+    @staticmethod
+    def _center(edits: Edits, cell: int) -> np.ndarray:
+        """Return the centroid of a cell."""
+        loops = [edits.positions(edits.seen(k, cell)) for k in edits.faces_of(cell)]
+        middles = [x.mean(axis=0) for x in loops]
+        apex, total, weight = np.mean(middles, axis=0), np.zeros(3), 0.0
+        for x, middle in zip(loops, middles, strict=True):
+            after = np.roll(x, -1, axis=0)
+            volumes = np.einsum("ij,ij->i", np.cross(x - apex, after - apex), (middle - apex)[None]) / 6
+            total += (volumes[:, None] * (x + after + middle + apex)).sum(axis=0) / 4
+            weight += volumes.sum()
+        return total / weight
 
     @staticmethod
     def _volume(edits: Edits, cell: int) -> float:
@@ -445,9 +495,10 @@ def cured(
     own: np.ndarray,
     sizes: np.ndarray,
     rejected: np.ndarray,
-    earlier: Cures | None,
+    earlier: Cures | None = None,
+    oblique: np.ndarray | None = None,
 ) -> tuple[Faces, np.ndarray, np.ndarray, np.ndarray, Cures | None]:
-    """Cure the `rejected` cells (k,) of a mesh where that works.
+    """Cure the `rejected` cells (k,) of a mesh where that works; or, if given, those with `oblique` faces, (k,) int.
 
     The mesh stays as it is if cures would leave more cells rejected. `earlier` cures are those of an earlier mesh of
     the solid; see `Cures`. Return the mesh; which of the given cells each of its cells was; `own` and the cells that
@@ -455,18 +506,23 @@ def cured(
     """
     if len(rejected) > _TOO_MANY * faces.n_cells:
         return faces, np.arange(faces.n_cells), own, rejected, None
-    cures = Cures(surface, faces, names, sizes, earlier)
-    cures.most = min(_MOST, cures.searches + _EACH * len(rejected))
-    todo, again = rejected.tolist(), True
-    while again:
-        again = False
-        cures.measure(cures.edits.alive(todo))
-        for cell in todo:
-            for _ in range(_BUDGET):
-                if not cures.cure(cell):
-                    break
-                again = True
-        todo = cures.edits.alive({*rejected.tolist(), *cures.edits.touched})
+    begun = (rejected if oblique is None else oblique).tolist()
+    cures = Cures(surface, faces, names, sizes, earlier, oblique is not None)
+    cures.most = min(cures.most, cures.searches + _EACH * len(begun))
+    for cures.branches in (_BRANCHES,) if oblique is None else (_BRANCHES, _MORE_BRANCHES):
+        if cures.strictly:
+            cures.tried.clear()
+        todo, again = begun, True
+        while again:
+            again = False
+            todo = cures.edits.alive(todo)
+            cures.measure(todo)
+            for cell in todo:
+                for _ in range(_BUDGET):
+                    if not cures.cure(cell):
+                        break
+                    again = True
+            todo = {*begun, *cures.edits.touched}
     made, cells = cures.edits.result()
     changed = np.isin(cells, [*rejected.tolist(), *cures.edits.touched])
     left = rejected_among(made, with_neighbors(made, changed), changed | touching_walls(made))

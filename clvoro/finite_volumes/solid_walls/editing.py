@@ -14,9 +14,14 @@ import numpy as np
 from ...mesh.connectivity import take_rows
 from ...mesh.faces import Faces
 from ..gate import LEAST_DETERMINANT, LEAST_MEASURE
+from ..measures import SolverMeasures
 
 _MOST_FACES = 200
 """A cell with more faces than this is no cell of the mesh. It stands for all cells far from walls; see `NearWalls`."""
+WANTED_ANGLE, WANTED_SKEWNESS = 20.0, 2.0
+"""Largest angle between a face and the line through the centroids of both cells, in degrees, and skewness of cells."""
+REJECTED = 1000.0
+"""How much worse what OpenFOAM rejects is than a face that is oblique."""
 _ROUNDING = 1e-9
 """Vertices of two meshes at the same place differ by at most this share of the extent of the mesh."""
 Face = tuple[int, int, tuple[int, ...]]
@@ -406,11 +411,12 @@ def between(loop: tuple[int, ...], begin: int, end: int) -> tuple[int, ...]:
     return loop[p : q + 1] if p <= q else loop[p:] + loop[: q + 1]
 
 
-def judge(trials: list[tuple[Edits, list[int]]]) -> list[tuple[np.ndarray, np.ndarray]]:
+def judge(trials: list[tuple[Edits, list[int]]], strictly: bool = False) -> list[tuple[np.ndarray, np.ndarray]]:
     """Judge some cells of each trial by the criteria of OpenFOAM, all together, as cells of one mesh.
 
     The result is a list of (excess, worst): by how much limits are exceeded, summed over all faces and pairs of faces
     of a cell, above 0 if OpenFOAM rejects it, (k,) float; and the worst of its measures over their limits, (k,) float.
+    With `strictly`, faces count, too, that are more oblique or skewed than wanted, far less than what is rejected.
     """
     owner, neighbor, loops, points = [], [], [], []
     judged: list[int] = []
@@ -460,12 +466,17 @@ def judge(trials: list[tuple[Edits, list[int]]]) -> list[tuple[np.ndarray, np.nd
     rows = np.array(judged)
     mine = np.zeros(cells, bool)
     mine[rows] = True
-    excess, worst = _measured(mesh, mine)
+    excess, worst = _measured(mesh, mine, strictly)
     ends = np.cumsum([len(chosen) for _, chosen in trials])[:-1]
     return list(zip(np.split(np.round(excess[rows], 6), ends), np.split(worst[rows], ends), strict=True))
 
 
-def _measured(mesh: Faces, mine: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def over_wanted(measures: SolverMeasures) -> np.ndarray:
+    """Return angle or skewness of each face over what is wanted, the larger one, (f,) float."""
+    return np.maximum(measures.non_orthogonality / WANTED_ANGLE, measures.skewness / WANTED_SKEWNESS)
+
+
+def _measured(mesh: Faces, mine: np.ndarray, strictly: bool) -> tuple[np.ndarray, np.ndarray]:
     """Return excess and worst as `judge` does, (n,) each, right for the cells that are `mine` (n,) bool."""
     m, g, n = mesh.measures, mesh.measures.geometry, mesh.n_cells
     c = m.coupled
@@ -486,4 +497,11 @@ def _measured(mesh: Faces, mine: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     excess += np.bincount(cells, 1 + sine, n)
     flat = LEAST_DETERMINANT / np.maximum(m.determinant, 1e-9)
     excess += (g.volumes < LEAST_MEASURE) + (flat > 1) + (m.aspect_ratio > 1000)
+    if strictly:
+        over = over_wanted(m)
+        wrong = np.clip(over - 1, 0, 3) + (over > 1)
+        excess *= REJECTED
+        for cells, rows in ((mesh.owner, slice(None)), (mesh.neighbor[inner], inner)):
+            excess += np.bincount(cells, wrong[rows], n)
+            np.maximum.at(most, cells, over[rows])
     return excess, np.maximum(most, flat)

@@ -19,6 +19,7 @@ from ..moves import FEW, MOVES, at_generators, least_bad, moved
 from .balance import balanced, unbalanced
 from .chains import Crossings, cross_cells
 from .cures import Cures, cured
+from .editing import REJECTED, WANTED_ANGLE, over_wanted
 from .mend import at_wall, changed_cells, narrow_faces, rejected_at_walls, touching_walls, with_neighbors
 from .near_walls import NearWalls
 from .pierce import IN, ON, OUT, WALL, pierce_edges, sides, simplified
@@ -43,13 +44,10 @@ _THIN, _ACROSS = 0.7, 0.35
 across it, over h."""
 _AROUND = 0.85
 """Generators nearer to a concave crease than this share of h stay: the faces between their cells meet in it."""
-_OBLIQUE, _OFF_CENTER = 20.0, 0.15
-"""Angle in degrees between a face and the line through the centroids of both cells, from which their generators are
-moved to the centroids; least distance from these, over h."""
+_OFF_CENTER = 0.15
+"""Least distance over h from which the generators of cells with oblique faces are moved to the centroids."""
 _CENTERINGS = 6
 """How often generators are moved there."""
-_REJECTED = 1000.0
-"""How bad a cell is that OpenFOAM rejects. A face is as bad as the square of its angle over `_OBLIQUE`, less 1."""
 _MANY, _SHARE = 250, 0.05
 """So many rejected cells, and such a share of those at walls, are more than cures can mend in a time like the run's:
 they stay as they are."""
@@ -94,13 +92,22 @@ class _Made:
         return at_generators(self.near.numbers[self.home[self.rejected]], len(self.near.points))
 
     def weigh_oblique(self) -> np.ndarray:
-        """Return how bad the cells of each generator are, those with oblique faces, too, (n + 1,) float."""
+        """Return how bad the cells of each generator are, those with oblique faces, too, (n + 1,) float.
+
+        A face is as bad as the square of its angle over `WANTED_ANGLE`, less 1.
+        """
         inner = slice(self.faces.n_inner)
         pairs = self.near.numbers[self.home][np.stack([self.faces.owner[inner], self.faces.neighbor[inner]])]
-        excess = np.maximum(self.faces.measures.non_orthogonality[inner] / _OBLIQUE - 1, 0) ** 2
+        excess = np.maximum(self.faces.measures.non_orthogonality[inner] / WANTED_ANGLE - 1, 0) ** 2
         excess[(pairs < 0).any(axis=0)] = 0
         oblique = at_generators(pairs.ravel(), len(self.near.points), np.tile(excess, 2))
-        return _REJECTED * self.count_rejected() + oblique
+        return REJECTED * self.count_rejected() + oblique
+
+    def oblique_cells(self) -> np.ndarray:
+        """Return the cells of faces that are more oblique or skewed than wanted, (k,) int."""
+        f, rest = self.faces, np.append(self.near.numbers[self.home] < 0, False)
+        found = (over_wanted(f.measures) > 1) & ~rest[f.owner] & ~rest[np.maximum(f.neighbor, -1)]
+        return distinct(np.concatenate([f.owner[found], f.neighbor[found & (f.neighbor >= 0)]]))
 
 
 def outer_generators(surface: WallSurface, points: np.ndarray, sizes: np.ndarray) -> np.ndarray:
@@ -166,7 +173,7 @@ def solid_diagram(
     tell: Callable[[str], object] = lambda _: None,
     warns: bool = True,
     held: int = 0,
-    centers: bool = True,
+    straight: bool = True,
 ) -> Diagram:
     """Return the mesh of a solid as a diagram, without short edges at walls.
 
@@ -180,8 +187,7 @@ def solid_diagram(
     - `tell`: called with the name of each part of the work.
     - `warns`: whether it warns of what is wrong with the mesh.
     - `held`: how many of the first generators are not moved.
-    - `centers`: move generators to the centroids of their cells where these are far and faces oblique, as at sharp
-      tips.
+    - `straight`: where faces are oblique, move generators to the centroids of their cells, then turn or collapse faces.
 
     Raises `InputError` if generators have no cell, as the solid is too thin there.
     With `warns` it warns with `MismatchWarning` if generators have no cell, cells are cut, leave out creases, or are
@@ -202,7 +208,7 @@ def solid_diagram(
             if last is None:
                 raise
             return None
-        made = _finished(surface, raw, None if last is None else last.cures, tell, centers and last is None)
+        made = _finished(surface, raw, None if last is None else last.cures, tell, straight and last is None)
         latest[:] = [made]
         return made
 
@@ -247,14 +253,18 @@ def solid_diagram(
     state = np.column_stack([points, np.full(len(points), EXACT)])
     first = remake(state, None)
     assert first is not None
-    spared = centers and _are_many(first.near, first.rejected)
+    spared = straight and _are_many(first.near, first.rejected)
     mesh = first if spared else least_bad(first, state, sizes, _Made.count_rejected, change, remake, goes_on)
     state[:, :3], state[:, 3] = mesh.near.points, EXACT
     state[mesh.near.rows, 3] = mesh.walls[:-1]
     latest[:] = [mesh]
-    trials = [True] * _CENTERINGS if centers and not spared else []
+    trials = [True] * _CENTERINGS if straight and not spared else []
     centered = least_bad(mesh, state, sizes, _Made.weigh_oblique, center, remake, trials)
     mesh = min(centered, mesh, key=lambda made: len(made.rejected))
+    if straight and not spared and len(oblique := mesh.oblique_cells()):
+        names, h = mesh.near.numbers[mesh.home], mesh.near.sizes[mesh.home]
+        faces, origin, own, rejected, _ = cured(surface, mesh.faces, names, mesh.own, h, mesh.rejected, oblique=oblique)
+        mesh = replace(mesh, faces=faces, home=mesh.home[origin], own=own, rejected=rejected)
     tell("cells without walls")
     faces, home = mesh.near.put_back(mesh.faces, mesh.home, mesh.own)
     if warns:

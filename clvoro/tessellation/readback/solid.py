@@ -77,5 +77,5 @@ def make_mesh(
         stages.release()
         return faces
 
-    centers = held is not None and domain.sheets is None
-    return solid_diagram(surface, points, sizes, whole, tell, warns, held or 0, centers)
+    straight = held is not None and domain.sheets is None
+    return solid_diagram(surface, points, sizes, whole, tell, warns, held or 0, straight)
