@@ -44,7 +44,7 @@ _SLIVER, _TIP, _FEW = 0.05, 0.4, 4
 others. So may up to `_FEW` cells without faces to others."""
 _TOO_MANY = 0.2
 """Share of rejected cells above which no cure is tried: the solid is as thin as a cell."""
-_BUDGET, _MOST, _MOST_OBLIQUE = 12, 1000, 300
+_BUDGET, _MOST, _MOST_OBLIQUE = 12, 1000, 150
 """Most changes of a rejected cell before others have their turn, and most searches for cures in meshes that are made
 one after another, and at oblique faces at the end."""
 _EACH = 6
@@ -321,12 +321,13 @@ class Cures:
 
     def tilts(self, edits: Edits, cell: int) -> Iterator[Edits]:
         """Turn an oblique face of a cell, about its center or a corner, towards the line through both centroids."""
+        center = self._center(edits, cell)
         for k in edits.faces_of(cell):
             other, loop = edits.across(k, cell), edits.seen(k, cell)
             if other < 0 or edits.is_vast(other):
                 continue
             x = edits.positions(loop)
-            normal, line = area_of(x), self._center(edits, other) - self._center(edits, cell)
+            normal, line = area_of(x), self._center(edits, other) - center
             normal, line = normal / np.linalg.norm(normal), line / np.linalg.norm(line)
             if normal @ line > math.cos(math.radians(WANTED_ANGLE)):
                 continue
