@@ -44,7 +44,7 @@ _SLIVER, _TIP, _FEW = 0.05, 0.4, 4
 others. So may up to `_FEW` cells without faces to others."""
 _TOO_MANY = 0.2
 """Share of rejected cells above which no cure is tried: the solid is as thin as a cell."""
-_BUDGET, _MOST, _MOST_OBLIQUE = 12, 1000, 150
+_BUDGET, _MOST, _MOST_OBLIQUE = 12, 1000, 100
 """Most changes of a rejected cell before others have their turn, and most searches for cures in meshes that are made
 one after another, and at oblique faces at the end."""
 _EACH = 6
