@@ -211,6 +211,13 @@ def check_integer(name: str, value: object, least: int, most: float = 2**63 - 1,
     return int(value)
 
 
+def check_flag(name: str, value: object) -> bool:
+    """Return `value` as a bool."""
+    if not isinstance(value, bool | np.bool_):
+        raise InputTypeError(f"{name} is {value!r:.60} of type {type(value).__name__}, expected True or False")
+    return bool(value)
+
+
 def check_number(name: str, value: object, *, above: float = -np.inf, least: float = -np.inf) -> float:
     """Return `value` as a finite float > `above` and >= `least`."""
     try:

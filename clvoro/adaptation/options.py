@@ -12,7 +12,16 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
 
 import numpy as np
 
-from ..arguments import check_callable, check_choice, check_integer, check_number, check_path, check_points, warn
+from ..arguments import (
+    check_callable,
+    check_choice,
+    check_flag,
+    check_integer,
+    check_number,
+    check_path,
+    check_points,
+    warn,
+)
 from ..errors import InputError, InputTypeError, UnusedOptionWarning
 from ..geometry.boundary_layers import Layers
 from ..geometry.domain import Domain
@@ -54,7 +63,7 @@ _USERS = {
 _WITHOUT_EFFECT = {"tol": 0, "levels": 0}
 """Values that change nothing in the other methods: these take all steps, and have no coarser levels."""
 
-_NUMBERS: dict[str, Callable[[str, object], float]] = {
+_CHECKS: dict[str, Callable[[str, object], float]] = {
     "levels": partial(check_integer, least=0, beside="'auto'"),
     "error_target": partial(check_number, above=0),
     "tol": partial(check_number, least=0),
@@ -63,17 +72,18 @@ _NUMBERS: dict[str, Callable[[str, object], float]] = {
     "seed": partial(check_integer, least=0, most=np.inf),
     "max_steps": partial(check_integer, least=0, most=_MOST_STEPS),
     "n_cells": partial(check_integer, least=1),
+    "correct": check_flag,
     "every": lambda name, value: math.inf if value == math.inf else check_number(name, value, least=0),
 }
 
 
-def _check_numbers(options: Any) -> None:
-    """Replace the numbers among the fields of `options` by checked ones."""
+def _check_values(options: Any) -> None:
+    """Replace the numbers and flags among the fields of `options` by checked ones."""
     for option in fields(options):
         value = getattr(options, option.name)
         absent = value is None or (isinstance(value, str) and value == "auto")
-        if option.name in _NUMBERS and not (absent and value == option.default):
-            object.__setattr__(options, option.name, _NUMBERS[option.name](option.name, value))
+        if option.name in _CHECKS and not (absent and value == option.default):
+            object.__setattr__(options, option.name, _CHECKS[option.name](option.name, value))
 
 
 @dataclass(frozen=True)
@@ -115,7 +125,7 @@ class MultilevelOptions:
     correct: bool = True
 
     def __post_init__(self) -> None:
-        _check_numbers(self)
+        _check_values(self)
 
 
 @dataclass(frozen=True)
@@ -155,7 +165,7 @@ class PaperOptions:
     k: float = 0.5
 
     def __post_init__(self) -> None:
-        _check_numbers(self)
+        _check_values(self)
 
 
 @dataclass(frozen=True)
@@ -203,7 +213,7 @@ class Checkpoint:
     resume: str | os.PathLike[str] | Literal[True] | None = None
 
     def __post_init__(self) -> None:
-        _check_numbers(self)
+        _check_values(self)
         if isinstance(self.resume, bool) and self.resume and self.path is None:
             raise InputError(
                 "resume is True without a path, expected Checkpoint(path, resume=True) or Checkpoint(resume=path)"
@@ -261,7 +271,7 @@ class Options:
         if not isinstance(layers, Layers | Sequence):
             hint = f"; write clvoro.Layers({layers!r})" if isinstance(layers, Real) else ""
             raise InputTypeError(f"layers is {layers!r}, expected clvoro.Layers or a sequence of them{hint}")
-        _check_numbers(self)
+        _check_values(self)
         object.__setattr__(self, "layers", (layers,) if isinstance(layers, Layers) else tuple(layers))
         for layer in self.layers:
             if not isinstance(layer, Layers):

@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING, Literal, get_args
 import numpy as np
 import orjson
 
+from ..arguments import check_flag
 from ..errors import InputError, InputTypeError
 from ..finite_volumes.gate import rejection
 from ..finite_volumes.prisms import polyhedra
@@ -232,9 +233,8 @@ def write_foam(
             "together as zones (mesh.to_openfoam(path, zones={name: mask})), or leave it out"
         )
     of_cells = _zones(contents.diagram, zones)
-    for name, value in (("binary", binary), ("check", check)):
-        if not isinstance(value, bool | np.bool_):
-            raise InputTypeError(f"{name} is {value!r:.60} of type {type(value).__name__}, expected True or False")
+    check_flag("binary", binary)
+    check_flag("check", check)
     mesh, made, change = poly_mesh(contents.diagram, patches, types, thickness, walls, check, processors is not None)
     folder = polymesh_folder(path) or path
     part, count = None, 0

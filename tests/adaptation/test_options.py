@@ -20,7 +20,7 @@ from clvoro.adaptation.options import (
 )
 from clvoro.cli import command as cli
 from clvoro.cli.cases import Case, builtin_cases, load_case
-from clvoro.errors import InputError, InputTypeError, UnusedOptionWarning
+from clvoro.errors import InputError, InputTypeError, MemoryLimitError, UnusedOptionWarning
 
 BOX = clvoro.Box((0, 0), (1, 1))
 SIZE = clvoro.sizing.Expression("0.16 + 0.1 * x")
@@ -140,8 +140,12 @@ def test_levels(adapter, tmp_path, capsys):
         MultilevelOptions(levels="2")
     with pytest.raises(InputError, match="levels is -1, expected at least 0"):
         MultilevelOptions(levels=-1)
+    with pytest.raises(InputTypeError, match="correct is 'no' of type str, expected True or False"):
+        MultilevelOptions(correct="no")
+    with pytest.raises(InputError, match=r"levels is 50, expected at most \d for 10000 cells"):
+        adapter.run(BOX, 0.01, options=MultilevelOptions(levels=50))
     # Sizes may require more cells than 64 bits can count.
-    with pytest.raises(InputError, match=r"levels is 50, expected at most 36 for \d{22} cells"):
+    with pytest.raises(MemoryLimitError, match=r"the run has 1e\+22 cells"):
         adapter.run(BOX, 1e-11, options=MultilevelOptions(levels=50))
     (tmp_path / "c.toml").write_text(CASE)
     for text in ("two", "-1"):
