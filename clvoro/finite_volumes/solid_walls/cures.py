@@ -44,11 +44,13 @@ _SLIVER, _TIP, _FEW = 0.05, 0.4, 4
 others. So may up to `_FEW` cells without faces to others."""
 _TOO_MANY = 0.2
 """Share of rejected cells above which no cure is tried: the solid is as thin as a cell."""
-_BUDGET, _MOST, _MOST_OBLIQUE = 12, 1000, 100
+_BUDGET, _MOST = 12, 1000
 """Most changes of a rejected cell before others have their turn, and most searches for cures in meshes that are made
-one after another, and at oblique faces at the end."""
+one after another."""
 _EACH = 6
 """Most searches in one mesh over the number of its rejected cells: parts of a cell may be cut again and again."""
+_OBLIQUE = 100
+"""Most searches at oblique faces, besides one for each cell that has such faces."""
 _AHEAD = 1
 """Where no cure of a cell helps, cures of the cells that OpenFOAM rejects after it may follow: how many in turn."""
 _BRANCHES, _MORE_BRANCHES, _MOST_BAD = 2, 6, 3
@@ -87,7 +89,7 @@ class Cures:
     ) -> None:
         self.surface, self.edits, self.names, self.sizes = surface, Edits(faces), names, sizes
         self.changes, self.searches, self.changed, self.tried = 0, 0, dict[int, int](), dict[int, int]()
-        self.most, self.branches, self.strictly = _MOST_OBLIQUE if strictly else _MOST, _BRANCHES, strictly
+        self.most, self.branches, self.strictly = _MOST, _BRANCHES, strictly
         self.excess: dict[int, tuple[int, float]] = {}
         self.judged: dict[tuple[Edits, int, bool], list[Option]] = {}
         if earlier is not None:
@@ -133,6 +135,34 @@ class Cures:
                 return True
         self.tried[cell] = self.stamp(cell)
         return False
+
+    def work_on(self, cells: list[int]) -> None:
+        """Cure cells, and those that change, until nothing helps."""
+        if self.strictly:
+            self.tried.clear()
+        self.most = min(self.most, self.searches + _EACH * len(cells))
+        todo, again = cells, True
+        while again:
+            again = False
+            todo = self.edits.alive(todo)
+            self.measure(todo)
+            for cell in todo:
+                for _ in range(_BUDGET):
+                    if not self.cure(cell):
+                        break
+                    again = True
+            todo = {*cells, *self.edits.touched}
+
+    def result(self, rejected: np.ndarray) -> tuple[Faces, np.ndarray, np.ndarray]:
+        """Return the mesh, the number of each of its cells, and those that OpenFOAM rejects, `rejected` (k,) before.
+
+        Cells beside the rest, see `NearWalls`, are not judged if they have not changed: they are right.
+        """
+        made, cells = self.edits.result()
+        changed = np.isin(cells, [*rejected.tolist(), *self.edits.touched])
+        rest = (cells < len(self.names)) & (self.names[np.minimum(cells, len(self.names) - 1)] < 0)
+        judged = with_neighbors(made, changed) & (changed | ~with_neighbors(made, rest))
+        return made, cells, rejected_among(made, judged, changed | touching_walls(made))
 
     def measure(self, cells: list[int]) -> None:
         """Judge cells that have changed, or with neighbors that have, since they were judged."""
@@ -509,24 +539,11 @@ def cured(
         return faces, np.arange(faces.n_cells), own, rejected, None
     begun = (rejected if oblique is None else oblique).tolist()
     cures = Cures(surface, faces, names, sizes, earlier, oblique is not None)
-    cures.most = min(cures.most, cures.searches + _EACH * len(begun))
+    if oblique is not None:
+        cures.most = _OBLIQUE + len(begun)
     for cures.branches in (_BRANCHES,) if oblique is None else (_BRANCHES, _MORE_BRANCHES):
-        if cures.strictly:
-            cures.tried.clear()
-        todo, again = begun, True
-        while again:
-            again = False
-            todo = cures.edits.alive(todo)
-            cures.measure(todo)
-            for cell in todo:
-                for _ in range(_BUDGET):
-                    if not cures.cure(cell):
-                        break
-                    again = True
-            todo = {*begun, *cures.edits.touched}
-    made, cells = cures.edits.result()
-    changed = np.isin(cells, [*rejected.tolist(), *cures.edits.touched])
-    left = rejected_among(made, with_neighbors(made, changed), changed | touching_walls(made))
+        cures.work_on(begun)
+    made, cells, left = cures.result(rejected)
     if len(left) > len(rejected):
         return faces, np.arange(faces.n_cells), own, rejected, None
     origin = np.array([cures.edits.origins.get(c, c) for c in cells.tolist()])
