@@ -61,13 +61,13 @@ def balanced(surface: WallSurface, faces: Faces) -> Faces:
     return replace(faces, points=points)
 
 
-def unbalanced(faces: Faces, chords: Faces, cells: np.ndarray) -> Faces:
-    """Return `faces` with the vertices of `cells` (k,) int where they were in `chords`, before `balanced`."""
+def unbalanced(faces: Faces, chords: np.ndarray, cells: np.ndarray) -> Faces:
+    """Return `faces` with the vertices of `cells` (k,) int where they were before `balanced`, at `chords` (v, 3)."""
     corners = take_rows(
         faces.starts, faces.corners, np.flatnonzero(np.isin(faces.owner, cells) | np.isin(faces.neighbor, cells))
     )[1]
     points = faces.points.copy()
-    points[corners] = chords.points[corners]
+    points[corners] = chords[corners]
     return replace(faces, points=points)
 
 

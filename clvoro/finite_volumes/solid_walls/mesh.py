@@ -325,10 +325,11 @@ def _finished(
     near, home, own, cures = raw.near, raw.home, raw.own, None
     tell("short edges at walls")
     faces, changed = _collapsed(raw.faces, near.sizes[home])
-    chords, faces = faces, balanced(surface, faces)
+    chords = faces.points
+    faces = balanced(surface, faces)
     tell("checks of cells at walls")
     rejected = rejected_at_walls(faces, changed | touching_walls(faces))
-    if len(rejected) and faces is not chords:
+    if len(rejected) and faces.points is not chords:
         faces = unbalanced(faces, chords, rejected)
         rejected = rejected_at_walls(faces, changed | touching_walls(faces))
     if len(rejected):  # where a face has been collapsed, another small one may bulge out
