@@ -141,7 +141,7 @@ Surface.rows Surface.tree""".split()
 
 
 def _leave_out(app, what, name, obj, skip, options):
-    """Leave members out of the pages of classes that only the package itself uses."""
+    """Leave out of the pages of classes the members that only the package itself uses."""
     function = getattr(obj, "fget", None) or getattr(obj, "func", None) or obj
     whole = getattr(function, "__qualname__", name)
     return True if name in _OF_DOMAINS or name in _INTERNAL or whole in _INTERNAL else None

@@ -285,7 +285,7 @@ class MeshState:
 
     @property
     def present(self) -> Present:
-        """The generators, to be inserted and deleted."""
+        """What insertions and deletions change: the generators and their cells, labels and fixed ones."""
         return Present(self.free, self.t, self._data.generators, self.next_label, self.fixed)
 
     def ordered(self, array: cla.Array) -> np.ndarray:

@@ -17,7 +17,7 @@ from .bvh import Tree
 from .columns import Columns
 from .shapes import coordinates
 from .surface_files import joined, read_parts
-from .triangles import crossing, packed_rows, packed_weights
+from .triangles import areas_of, crossing, packed_rows, packed_weights
 
 _ROUND_OFF = 1e-12  # of the extent: vertices that are nearer to each other are one
 _BLOCK = 1 << 14  # pairs of triangles per batch: they stay in the caches
@@ -132,8 +132,7 @@ class Surface:
     @cached_property
     def areas(self) -> np.ndarray:
         """Areas of the triangles, (t,) float, in units of the bounding box's longest edge squared."""
-        a, b, c = np.moveaxis(self._unit_corners, 1, 0)
-        return 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
+        return areas_of(self._unit_corners)
 
     @cached_property
     def tree(self) -> Tree:

@@ -144,3 +144,9 @@ def crossing(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 def _largest(rows: np.ndarray) -> np.ndarray:
     """Return the largest of three numbers in each column of (3, m); faster than along a short axis."""
     return np.maximum(np.maximum(rows[0], rows[1]), rows[2])
+
+
+def areas_of(corners: np.ndarray) -> np.ndarray:
+    """Return the areas (t,) of triangles with these corners (t, 3, 3)."""
+    a, b, c = np.moveaxis(corners, 1, 0)
+    return 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)

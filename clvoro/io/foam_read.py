@@ -286,7 +286,7 @@ class FoamFile:
 
 
 def load_foam(path: str | PathLike[str], tessellate: Callable[[Domain, np.ndarray], Diagram]) -> Diagram:
-    """Read the mesh of a decomposed case from the generators beside the meshes of its processors.
+    """Read a decomposed case of OpenFOAM: the file `generators` of each processor.
 
     `tessellate` makes the cells again. Their order is that of the mesh before it was decomposed.
 
@@ -305,7 +305,7 @@ def load_foam(path: str | PathLike[str], tessellate: Callable[[Domain, np.ndarra
 
 
 def _with_generators(path: str | PathLike[str]) -> list[Path]:
-    """Return the folders of all processors of the case of a file ``.foam``, if they have generators; else none."""
+    """Return the folders of all processors of the case with this file ``.foam``; none if one lacks generators."""
     case = Path(path).parent
     folders = [case / f"processor{k}" / "constant" / "polyMesh" for k in range(len([*case.glob("processor*")]))]
     there = Path(path).suffix.lower() == ".foam" and all((folder / GENERATORS).exists() for folder in folders)

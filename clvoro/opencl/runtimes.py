@@ -101,13 +101,14 @@ def remove_dead_locks() -> None:
 
     With such a lock PyOpenCL waits for a minute, and fails.
     """
-    with contextlib.suppress(OSError, RuntimeError):  # a lock is gone, or the user has no home
+    with contextlib.suppress(RuntimeError):  # the user has no home
         for lock in cache_home().glob("pyopencl/*/lock"):
-            made, began = lock.stat().st_mtime_ns, time.monotonic()
-            while lock.stat().st_mtime_ns == made:
-                if time.monotonic() - began > _HELD:
-                    lock.unlink()
-                time.sleep(0.01)
+            with contextlib.suppress(OSError):  # it is gone
+                made, began = lock.stat().st_mtime_ns, time.monotonic()
+                while lock.stat().st_mtime_ns == made:
+                    if time.monotonic() - began > _HELD:
+                        lock.unlink()
+                    time.sleep(0.01)
 
 
 def cache_home() -> Path:

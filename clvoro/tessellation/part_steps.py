@@ -555,7 +555,7 @@ class PartSteps(DomainSteps):
         x, limits = part.points[: part.n_own].get().astype(float), self._limits
         moves, share = np.linalg.norm(x - self._balls.centers, axis=1), 1 - 1e-5
         far = np.flatnonzero(moves > share * limits[:, 1])
-        # Balls are compared with places where generators may be, so these are found first.
+        # The radii of balls depend on how far generators may move: ways come first.
         if beyond and not self._limit_anew(1, far, SKIN * self._caps[far], x, moves, needed + moves, SKIN / 4):
             return False
         moves[far] = 0
@@ -575,7 +575,7 @@ class PartSteps(DomainSteps):
         used: np.ndarray,
         enough: float,
     ) -> bool:
-        """Set the limits of one `kind` of own generators `rows` (k,), now at `x`, to at most those `wanted` (k,).
+        """Limit radii, or ways if `kind` is 1, of own generators `rows` (k,), now at `x`, to `wanted` (k,) or less.
 
         Limits of other parts' generators that do not know these, or are not known, become smaller, by at most half of
         what is more than `used` (n,). Return whether all limits are the share `enough` of the wanted ones.

@@ -14,9 +14,10 @@ _DEEPEST = 0.15
 """Largest depth of a polygon below the surface that is balanced, over the root of its area: where details are smaller
 than polygons, depths do not follow from the curvature."""
 _INNER = 0.01
-"""Weight of the planes of inner faces against those of walls, for vertices that cannot stay in all of them."""
+"""A vertex stays in the planes of the faces between cells, and moves off its walls by their depths. Where it cannot do
+both, the planes count this much, the depths 1."""
 _LONGEST = 2.0
-"""Longest way of a vertex over the depths that it makes up for."""
+"""Longest way of a vertex, over the largest depth of the wall polygons around it."""
 
 
 def balanced(surface: WallSurface, faces: Faces) -> Faces:

@@ -137,7 +137,7 @@ class Cures:
         return False
 
     def work_on(self, cells: list[int]) -> None:
-        """Cure cells, and those that change, until nothing helps."""
+        """Cure these cells, and those that cures change, until no cure helps any more."""
         if self.strictly:
             self.tried.clear()
         self.most = min(self.most, self.searches + _EACH * len(cells))
@@ -529,7 +529,7 @@ def cured(
     earlier: Cures | None = None,
     oblique: np.ndarray | None = None,
 ) -> tuple[Faces, np.ndarray, np.ndarray, np.ndarray, Cures | None]:
-    """Cure the `rejected` cells (k,) of a mesh where that works; or, if given, those with `oblique` faces, (k,) int.
+    """Cure the `rejected` cells (k,) of a mesh where that works. If `oblique` cells (k,) are given, mend their faces.
 
     The mesh stays as it is if cures would leave more cells rejected. `earlier` cures are those of an earlier mesh of
     the solid; see `Cures`. Return the mesh; which of the given cells each of its cells was; `own` and the cells that

@@ -19,8 +19,9 @@ from ..measures import SolverMeasures
 _MOST_FACES = 200
 """A cell with more faces than this is no cell of the mesh. It stands for all cells far from walls; see `NearWalls`."""
 WANTED_ANGLE, WANTED_SKEWNESS = 19.0, 2.0
-"""Largest angle between a face and the line through the centroids of both cells, in degrees, and skewness of cells. The
-mesh for solvers adds a degree or two."""
+"""Largest non-orthogonality of a face in degrees, and largest skewness. Faces near walls that exceed one of them are
+turned or collapsed. Non-orthogonality is the angle between the normal and the line through the centroids of both cells;
+`solver_mesh`, which collapses short edges, may add two degrees."""
 REJECTED = 1000.0
 """How much worse what OpenFOAM rejects is than a face that is oblique."""
 _ROUNDING = 1e-9

@@ -27,7 +27,7 @@ from ..polygon import Polygon
 from ..shapes import Edges
 from ..surface import Surface
 from ..surface_files import SOLIDS, FilePart, FilePath, joined, parts_of, read_parts, word
-from ..triangles import packed_weights, pierced
+from ..triangles import areas_of, packed_weights, pierced
 from ..wall_triangles import WallTriangles
 from .checks import repaired, require_bounding, sharp_edges, volume_inside
 from .combining import around, boolean, named_triangles
@@ -105,7 +105,7 @@ def _samples(triangles: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, np
     _, first = np.unique(triangles, return_index=True)
     points, item = [corners.reshape(-1, 3)[first]], [first // 3]
     longest = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2).max(axis=1)
-    spacing = math.sqrt(float(_areas(corners).sum()) / _SAMPLES)
+    spacing = math.sqrt(float(areas_of(corners).sum()) / _SAMPLES)
     steps = np.minimum(np.ceil(longest / spacing), _MOST_STEPS).astype(int) if spacing > 0 else np.ones(len(corners))
     for k in np.unique(steps[steps > 1]).tolist():
         rows = np.flatnonzero(steps == k)
@@ -206,7 +206,7 @@ class Solid(Domain):
         given = Surface(vertices, triangles, name, join)
         group = _checked_groups(name, groups, len(given))
         self.repairs: tuple[str, ...] = ()
-        given_area, given_volume = _areas(given.corners), volume_inside(given.corners)
+        given_area, given_volume = areas_of(given.corners), volume_inside(given.corners)
         known = ["wall"] if group_names is None and groups is None else list(group_names or ())
         known += [f"group-{g}" for g in range(len(known), int(group.max()) + 1)]
         self._group_names = tuple(known)
@@ -897,7 +897,7 @@ def _from_parts(parts: list[FilePart], unit: float) -> dict[str, Any]:
 
 
 def _with_options(made: dict[str, Any], options: dict[str, Any]) -> dict[str, Any]:
-    """Return the arguments of a simple solid with those of the caller; a single name is for the whole surface."""
+    """Return the arguments `made` for a ball, a box, ... with the caller's `options`; one name is for all its sides."""
     single = len(options.get("group_names") or ()) == 1
     return {**made, **({"groups": None} if single else {}), **options}
 
@@ -914,10 +914,6 @@ def _kept_groups(name: str, names: object, groups: tuple[str, ...]) -> list[str]
             "for all groups that names does not mention"
         )
     return [wall for wall in kept if wall in groups and len(groups) > 1]
-
-
-def _areas(corners: np.ndarray) -> np.ndarray:
-    return 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
 
 
 def _checked_groups(name: str, groups: object, count: int) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Wrap triangles that bound no region, or have details finer than cells: a closed surface a little away from them.
+"""A closed surface around triangles that bound no region, or have details finer than cells.
 
 The distance from the triangles is sampled on a grid. Places farther than `reach` from them that are connected with the
 border of the grid, or with a point inside, are the space around them, and a surface bounds it. A second surface lies
@@ -19,6 +19,7 @@ import scipy
 from ...arguments import format_point
 from ...errors import InputError
 from ..surface import Surface
+from ..triangles import areas_of
 from .combining import boolean, library
 from .creases import connect, pair_sides
 
@@ -35,7 +36,8 @@ _MOST = 50_000_000
 _SNAP = 0.25
 """A vertex moves onto the border of a group if that is nearer to it along an edge than this share of the edge."""
 _FACING = 0.5
-"""How much nearer a triangle is that faces a point."""
+"""A point above a triangle counts as nearer to its group than a point as far away beside it, by this share of the
+height: a side that faces a place of the wrap gives it its group."""
 _SMOOTHINGS = 3
 """How often vertices at borders of groups move halfway to the middle between those beside them."""
 _ISLAND = 2.0
@@ -278,7 +280,7 @@ def _split(
 def _without_islands(surface: Surface, group: np.ndarray, least: float) -> np.ndarray:
     """Return groups (t,) of which connected parts with less area than `least` have that of the longest border."""
     group, corners = group.copy(), surface.corners
-    areas = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    areas = areas_of(corners)
     length = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2).reshape(-1)
     side = np.arange(len(length))
     here, there = side // 3, pair_sides(surface.vertices, surface.triangles)[0] // 3
