@@ -7,7 +7,8 @@ killed, its callback raises an error, its disk is full (RLIMIT_FSIZE), or it has
 `longest s` is the longest time from the fault to the end of `mpiexec`. It is not measured on a full disk, since the run
 then goes on without checkpoints and fails at its end. `most messages` is the largest number of lines "clvoro: ..." on
 the standard error of one run; `without` counts the runs that print none, as where a process is killed. `checkpoints`
-counts the runs that leave a checkpoint, `damaged` the checkpoints that cannot be read. Needs `pip install -e '.[mpi]'`.
+counts the runs that leave a checkpoint, `damaged` the checkpoints that cannot be read. Standard error has a line for
+each fault when its run ends. Needs `pip install -e '.[mpi]'`.
 """
 
 from __future__ import annotations
@@ -123,6 +124,7 @@ def main() -> None:
     for k in range(options.times):
         kind = KINDS[k % len(KINDS)]
         found[kind].append(fail_once(kind, rng.randint(1, 55), options.ranks))
+        print(k + 1, kind, found[kind][-1], file=sys.stderr, flush=True)
     table = Report(options.json, COLUMNS)
     for kind, runs in found.items():
         if runs:

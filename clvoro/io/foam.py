@@ -256,6 +256,7 @@ def write_foam(
         make_folder(settings.parent)
         with atomic_file(settings) as file:
             head = _header("decomposeParDict", "", False).replace("regIOobject", "dictionary")
+            head = head.replace("constant/polyMesh", "system")
             coefficients = f"simpleCoeffs\n{{\n    n ({count} 1 1);\n    delta 0.001;\n}}\n"
             file.write(f"{head}numberOfSubdomains {count};\nmethod simple;\n{coefficients}".encode("ascii"))
     diagram, domain = contents.diagram, json.dumps(describe(contents.diagram.domain))

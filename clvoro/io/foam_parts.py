@@ -155,6 +155,7 @@ def decompose(mesh: Faces, patches: list[FoamPatch], part: np.ndarray) -> Iterat
     of_patch = np.full(n, -1)
     for k, (begin, end) in enumerate(zip(begins, ends, strict=True)):
         of_patch[begin:end] = k
+    partner = {k: of_patch[mesh.twin[row]] for k, row in zip(of_patch[seam], seam, strict=True)} | {-1: -1}
     for p in range(int(part.max()) + 1):
         own, same = here == p, here == there
         lists, made = [np.flatnonzero(own & same & (of_patch < 0))], []
@@ -167,7 +168,10 @@ def decompose(mesh: Faces, patches: list[FoamPatch], part: np.ndarray) -> Iterat
         other = np.where(own[shared], there[shared], here[shared])
         for q in distinct(other):
             rows = shared[other == q]
-            for k in distinct(of_patch[rows]):
+            kinds = distinct(of_patch[rows]).tolist()
+            if p > q:  # OpenFOAM sends patch by patch: both processors must have them in the same order
+                kinds.sort(key=lambda k: partner[k])
+            for k in kinds:
                 lists.append(rows[of_patch[rows] == k])
                 made.append(_between(p, int(q), len(lists[-1]), patches[k] if k >= 0 else None))
                 numbers.append(-1)
