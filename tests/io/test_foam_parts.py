@@ -46,7 +46,8 @@ def loops_of(faces, points):
 @pytest.mark.parametrize("name", DOMAINS)
 def test_processors_have_the_whole_mesh_and_match_each_other(meshes, tmp_path, name):
     mesh, count = meshes[name], 3
-    mesh.to_openfoam(tmp_path / "case.foam", processors=parts_of(mesh), zones={"left": mesh.points[:, 0] < 0.5}, check=False)
+    zones = {"left": mesh.points[:, 0] < 0.5}
+    mesh.to_openfoam(tmp_path / "case.foam", processors=parts_of(mesh), zones=zones, check=False)
     points, faces, owner, neighbor, patches = read(tmp_path / "constant/polyMesh")
     seen, cells, between = np.zeros(len(faces), int), [], {}
     for p in range(count):
