@@ -26,7 +26,7 @@ from ..solvers.linear_system import Solution
 from ..tessellation.bins import BinnedPoints
 from ..tessellation.decomposition import distribute, is_balanced
 from ..tessellation.device_diagram import Tessellation
-from ..tessellation.readback.diagram import order_of
+from ..tessellation.readback.diagram import fetch_diagram, order_of
 from ..tessellation.readback.parts import fetch_part
 from ..tessellation.tessellator import Tessellator
 from .density import CellWeights
@@ -678,7 +678,11 @@ class MeshState:
         latest = [tessellator.steps.measure_exactly(self.t)]
         self.tessellation = None
         self.stages.release()
-        return fetch_part(tessellator.stages.engine.alone(), self.domain, latest.pop(), self.labels, held)
+        engine = tessellator.stages.engine.alone()
+        if latest[0].part is not None:
+            return fetch_part(engine, self.domain, latest.pop(), self.labels)
+        # No list or frame here holds the cells any longer: a solid frees them before it makes others.
+        return fetch_diagram(engine, self.domain, latest.pop(), self.labels, copy=False, held=held)
 
 
 def _take_apart(new: Outcome | None) -> tuple[dict[str, cla.Array], tuple[int, int]]:

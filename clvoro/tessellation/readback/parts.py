@@ -25,10 +25,9 @@ from ..tessellator import Tessellator
 from .diagram import fetch_diagram, order_of, starts_of
 
 
-def fetch_part(engine: Engine, domain: Domain, t: Tessellation, labels: cla.Array, held: int | None = None) -> Diagram:
+def fetch_part(engine: Engine, domain: Domain, t: Tessellation, labels: cla.Array) -> Diagram:
     """Return the cells of a part in the order of `labels` (n,). Faces towards cells of part k are walls ``"rankK"``."""
-    if t.part is None:
-        return fetch_diagram(engine, domain, t, labels, copy=False, held=held)
+    assert t.part is not None
     (n, part, whole), own = (t.n, t.part, t.whole), labels.get()[: t.n]
     points = fetch_diagram(engine, unfolded(domain), replace(t, part=None), labels, copy=False).points
     names = np.array([f"rank{number}" for number in part.ghosts.parts] if part.ghosts else [], object)
