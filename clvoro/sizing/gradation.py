@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Iterator, Sequence
+from itertools import product
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
 if TYPE_CHECKING:
     import pyopencl.array as cla
 
+    from ..geometry.domain import Domain
+    from ..geometry.sphere import Sphere
     from ..opencl.engine import Engine
 
 _TILE = {2: 16, 3: 8}  # nodes along a side
@@ -23,12 +26,73 @@ def globe_columns(least: float) -> int:
     return pair * (2 * math.ceil(max(least / pair - 1, 0) / 2) + 1)
 
 
+class Grid:
+    """The nodes of a grid over the bounding box of a domain. Values (n,) are in an order in which x runs fastest.
+
+    - `counts` (d,) int: number of nodes along each axis.
+    - `spacing` list of float: distance of the nodes along each axis, in the unit of the device.
+    - `corners`, `at`: as `Raster` takes them.
+    """
+
+    globe = False
+    at: Literal["nodes", "centers"] = "nodes"
+
+    def __init__(self, box: Domain, counts: np.ndarray) -> None:
+        self.counts, self.corners = counts, (box.lower, box.upper)
+        self.axes = [np.linspace(low, up, n) for low, up, n in zip(*self.corners, counts.tolist(), strict=True)]
+        self.spacing = (box.extent / (counts - 1) / box.frame[1]).tolist()
+
+    def __len__(self) -> int:
+        return math.prod(self.counts.tolist())
+
+    def nodes(self, rows: np.ndarray) -> np.ndarray:
+        """Return the places of nodes (k,) int, (k, d)."""
+        places = np.unravel_index(rows, self.counts, order="F")
+        return np.column_stack([axis[i] for axis, i in zip(self.axes, places, strict=True)])
+
+    def around(self, marks: np.ndarray) -> Iterator[np.ndarray]:
+        """Yield the nodes at one corner after the other of the boxes of nodes around `marks` (k, d), (k,) int each."""
+        first = [
+            np.clip(np.searchsorted(axis, x, side="right") - 1, 0, len(axis) - 2)
+            for axis, x in zip(self.axes, marks.T, strict=True)
+        ]
+        for corner in product((0, 1), repeat=len(first)):
+            place = [i + c for i, c in zip(first, corner, strict=True)]
+            yield np.ravel_multi_index(place, tuple(self.counts), order="F")
+
+
+class GlobeGrid(Grid):
+    """A grid of longitude and latitude around a sphere: nodes are the centers of pixels, `columns` along the equator.
+
+    It is closed across the date line and across the poles. The spacing along x is that at the equator.
+    """
+
+    globe = True
+    at = "centers"
+
+    def __init__(self, sphere: Sphere, columns: int) -> None:
+        self.sphere, self.counts, self.corners = sphere, np.array([columns, columns // 2]), ((-180, -90), (180, 90))
+        self.spacing = [2 * math.pi / columns, math.pi / (columns // 2)]
+
+    def nodes(self, rows: np.ndarray) -> np.ndarray:
+        """Return the positions of nodes (k,) int, (k, 3)."""
+        columns = self.counts[0]
+        places = np.column_stack([rows % columns + 0.5, rows // columns + 0.5])
+        return self.sphere.positions(places * (360 / columns) - (180, 90))
+
+    def around(self, marks: np.ndarray) -> Iterator[np.ndarray]:
+        """Yield the nodes around positions `marks` (k, 3), as `Grid.around`."""
+        (nx, ny), (lon, lat) = self.counts, self.sphere.lonlat(marks).T
+        column, row = (np.floor(x / (360 / nx) - 0.5).astype(int) for x in (lon + 180, lat + 90))
+        for right, up in product((0, 1), repeat=2):
+            yield (column + right) % nx + nx * np.clip(row + up, 0, ny - 1)
+
+
 class Gradation:
     """Lower the values on a grid until their gradient is bounded.
 
     - `engine`: of the dimension of the grid.
-    - `globe`: whether the grid is one of longitude and latitude around a sphere, with nodes at the centers of pixels.
-      Then it has `globe_columns` values along a row, and the spacing along x is that at the equator.
+    - `globe`: whether grids are those of `GlobeGrid`, with `globe_columns` columns.
     """
 
     def __init__(self, engine: Engine, globe: bool = False):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from itertools import product
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,16 +14,18 @@ from ..opencl.engine import PLAIN, Engine, Traits
 from ..opencl.memory_limits import host_memory
 from .arguments import check_slope, coverage_warnings
 from .field import Field, as_field, count_parts, on_domain
+from .gradation import GlobeGrid, Gradation, Grid, globe_columns
 from .raster import Raster
 
 if TYPE_CHECKING:
     from .codegen import CodeWriter
 
-MOST_NODES = 1 << 22  # by default
+_MOST_NODES = 1 << 22  # by default
 _MAX_NODES_GIVEN = 2**31 - 1  # of a resolution that the caller gives
-BATCH = 1 << 18  # nodes that are evaluated at once
+_BATCH = 1 << 18  # nodes that are evaluated at once
 _BYTES_PER_NODE = 48  # on the host, at most
 _PROBES = {2: 129, 3: 33}  # nodes along the longest side of the grid that samples the smallest size
+_PROBES_ON_GLOBE, _LEAST_ON_GLOBE = 1 << 13, 128  # places that sample it on a sphere, least number along the equator
 
 
 class Graded(Field):
@@ -113,7 +114,7 @@ class Graded(Field):
         known = [raster for (b, _), raster in self._rasters.items() if b == box]
         if engine is None and known:
             return known[0]
-        engine = engine or default_engine(box.dim)
+        engine = engine or default_engine(box.dim, PLAIN if box.globe is None else box.traits(np.dtype(np.float64)))
         key = (box, engine.real)
         if key not in self._rasters:
             self._rasters[key] = self._compute(box, engine)
@@ -136,59 +137,60 @@ class Graded(Field):
         return self.raster()._evaluate(points)
 
     def _emit(self, writer: CodeWriter) -> str:
+        return self.raster_for(writer, writer.domain)._emit(writer)
+
+    def raster_for(self, writer: CodeWriter, domain: Domain) -> Raster:
+        """Return `raster` for `domain`, and tell `writer` what memory its computation took, if there was one."""
         known = len(self._rasters)
-        raster = self.raster(writer.domain, writer.engine)
+        raster = self.raster(domain, writer.engine)
         if len(self._rasters) > known:
             writer.peak_bytes = max(writer.peak_bytes, self._peak_bytes)
-        return raster._emit(writer)
+        return raster
 
     def _compute(self, box: Domain, engine: Engine) -> Raster:
         from .evaluation import Sizing
-        from .gradation import Gradation
 
         evaluate = Sizing(engine, box, self.field)
-        marks = self.field.landmarks(box)
+        marks = evaluate.field.landmarks(box)
         marks = marks[box.contains(marks)]
         at_marks = evaluate(marks) if len(marks) else np.zeros(0)
-        counts = self._counts(box, evaluate, at_marks)
-        self._check_room(math.prod(counts.tolist()), engine)
-        axes = _axes(box, counts)
-        values = np.empty(np.prod(counts))
-        for first in range(0, len(values), BATCH):
-            flat = np.arange(first, min(first + BATCH, len(values)))
-            places = np.unravel_index(flat, counts, order="F")
-            nodes = np.column_stack([axis[i] for axis, i in zip(axes, places, strict=True)])
-            values[flat] = self._at_nodes(box, evaluate, nodes, axes)
+        grid = self._grid(box, evaluate, at_marks)
+        self._check_room(len(grid), engine)
+        values = np.empty(len(grid))
+        for first in range(0, len(values), _BATCH):
+            rows = np.arange(first, min(first + _BATCH, len(values)))
+            values[rows] = self._at_nodes(box, evaluate, grid, rows)
         # Nodes outside of the domain: above all values that sizes can grow to.
         far = np.isinf(values)
         values[far] = values[~far].max(initial=0) + self.slope * box.extent.sum()
-        self._seed(values, counts, axes, marks, at_marks)
-        scale = box.frame[1]
-        # Free the memory of the evaluation first.
-        peak_bytes = evaluate.peak_bytes
-        del evaluate
+        for rows in grid.around(marks) if len(marks) else ():
+            away = box.lengths(np.linalg.norm(grid.nodes(rows) - marks, axis=1))
+            np.minimum.at(values, rows, at_marks + self.slope * away)
+        scale, peak_bytes = box.frame[1], evaluate.peak_bytes
+        del evaluate  # frees its memory
+        if grid.globe:
+            engine = Engine(engine.ctx, engine.queue, 2, engine.real, workspace=engine.workspace, pool=engine.pool)
         on_device = engine.upload(values / scale)
         self._peak_bytes = max(peak_bytes, on_device.nbytes)
-        spacing = box.extent / (counts - 1)
-        Gradation(engine).sweep_tiles(on_device, counts.tolist(), (spacing / scale).tolist(), self.slope)
+        Gradation(engine, grid.globe).sweep_tiles(on_device, grid.counts.tolist(), grid.spacing, self.slope)
         limited = np.minimum(on_device.get().astype(float) * scale, values)
-        return Raster(limited.reshape(counts[::-1]), box.lower, box.upper)
+        return Raster(limited.reshape(grid.counts[::-1]), *grid.corners, at=grid.at)
 
     def _at_nodes(
-        self, box: Domain, evaluate: Callable[[np.ndarray], np.ndarray], nodes: np.ndarray, axes: list[np.ndarray]
+        self, box: Domain, evaluate: Callable[[np.ndarray], np.ndarray], grid: Grid, rows: np.ndarray
     ) -> np.ndarray:
-        """Return the field at nodes (n, d); infinite at those outside the domain.
+        """Return the field at nodes (k,) int of `grid`; infinite at those outside the domain.
 
         A node at most one spacing outside gets the value that the nearest point inside allows, so that no narrow strait
         is lost between the nodes.
         """
-        polygon = box.outline
+        polygon, nodes = box.outline, grid.nodes(rows)
         if polygon is None:
             return evaluate(nodes)
         values = np.full(len(nodes), math.inf)
         inside = box.contains(nodes)
         out = np.flatnonzero(~inside)
-        spacing = float(np.hypot(*(axis[1] - axis[0] for axis in axes)))
+        spacing = float(np.hypot(*(axis[1] - axis[0] for axis in grid.axes)))
         edge, nearest = polygon.nearest_edge(nodes[out], within=spacing)
         near = edge >= 0
         places = np.concatenate([nodes[inside], nearest[near]])
@@ -198,6 +200,20 @@ class Graded(Field):
             values[inside] = h[: np.count_nonzero(inside)]
             values[out[near]] = h[np.count_nonzero(inside) :] + self.slope * away
         return values
+
+    def _grid(self, box: Domain, evaluate: Callable[[np.ndarray], np.ndarray], at_marks: np.ndarray) -> Grid:
+        """Return the grid over `box`, for a field with the values `at_marks`."""
+        globe = box.globe
+        if globe is None:
+            return Grid(box, self._counts(box, evaluate, at_marks))
+        if isinstance(self.resolution, int):
+            return GlobeGrid(globe, globe_columns(self.resolution))
+        least = min(evaluate(globe.even_points(_PROBES_ON_GLOBE)).min(), at_marks.min(initial=math.inf))
+        wanted = max(2 * math.pi * globe.radius / least, _LEAST_ON_GLOBE)
+        columns = globe_columns(min(wanted, math.sqrt(2 * _MOST_NODES)))
+        while columns * columns // 2 > _MOST_NODES:
+            columns = globe_columns(columns - 64)
+        return GlobeGrid(globe, columns)
 
     def _counts(self, box: Domain, evaluate: Callable[[np.ndarray], np.ndarray], at_marks: np.ndarray) -> np.ndarray:
         """Return the numbers of nodes along the axes."""
@@ -214,14 +230,13 @@ class Graded(Field):
             return counts
         coarse = longest / (_PROBES[box.dim] - 1)
         counts = _along(box, coarse)
-        grid = _axes(box, counts)
-        probes = np.stack(np.meshgrid(*grid, indexing="ij"), axis=-1).reshape(-1, box.dim)
+        probes = np.stack(np.meshgrid(*Grid(box, counts).axes, indexing="ij"), axis=-1).reshape(-1, box.dim)
         if box.cuts_cells:
             probes = np.concatenate([probes[box.contains(probes)], box.inner_points()])
         least = min(evaluate(probes).min(), at_marks.min(initial=math.inf))
-        finest = (box.measure / MOST_NODES) ** (1 / box.dim)
+        finest = (box.measure / _MOST_NODES) ** (1 / box.dim)
         spacing = min(max(least, finest), coarse)
-        while np.prod(_along(box, spacing), dtype=float) > MOST_NODES:
+        while np.prod(_along(box, spacing), dtype=float) > _MOST_NODES:
             spacing *= 1.02
         return _along(box, spacing)
 
@@ -240,27 +255,8 @@ class Graded(Field):
                     f"{needed / 2**30:.3g} GiB; {where} has {has / 2**30:.3g} GiB. Give a smaller one, or leave it out"
                 )
 
-    def _seed(
-        self, values: np.ndarray, counts: np.ndarray, axes: list[np.ndarray], marks: np.ndarray, at_marks: np.ndarray
-    ) -> None:
-        """Lower the nodes around each landmark to the values that it allows."""
-        first = [
-            np.clip(np.searchsorted(axis, x, side="right") - 1, 0, len(axis) - 2)
-            for axis, x in zip(axes, marks.T, strict=True)
-        ]
-        for corner in product((0, 1), repeat=len(axes)):
-            place = [i + c for i, c in zip(first, corner, strict=True)]
-            node = np.column_stack([axis[i] for axis, i in zip(axes, place, strict=True)])
-            bound = at_marks + self.slope * np.linalg.norm(node - marks, axis=1)
-            np.minimum.at(values, np.ravel_multi_index(place, tuple(counts), order="F"), bound)
-
     def __repr__(self) -> str:
         return f"Graded({self.field!r}, slope={self.slope:g})"
-
-
-def _axes(box: Domain, counts: np.ndarray) -> list[np.ndarray]:
-    """Return the coordinates of the nodes along each axis."""
-    return [np.linspace(low, high, n) for low, high, n in zip(box.lower, box.upper, counts.tolist(), strict=True)]
 
 
 def _along(box: Domain, spacing: float) -> np.ndarray:

@@ -301,7 +301,7 @@ def test_resolution_is_chosen_and_capped(queue, monkeypatch):
     assert shape(0.3, resolution=21) == (11, 21)
     assert shape(0.3, resolution=(7, 5)) == (5, 7)
     tiny = sizing.Distance(sizing.Circle((0, 3.5), 0), 1e-5, slope=1)
-    monkeypatch.setattr("clvoro.sizing.graded.MOST_NODES", 2**16)
+    monkeypatch.setattr("clvoro.sizing.graded._MOST_NODES", 2**16)
     ny, nx = shape(tiny)
     assert 0.9 * 2**16 < nx * ny <= 2**16
     assert nx == pytest.approx(2 * ny, rel=0.01)

@@ -108,7 +108,7 @@ def check_measures(check: Check, g: Rebuilt, positions: Doubts) -> None:
     d = check.diagram
     if g.remade:
         return
-    dim, n = d.domain.dim, len(d)
+    dim, n, cut = d.domain.dim, len(d), d.domain.cuts_cells
     own = ROUNDINGS * g.unit_of_cell
     doubts = g.doubts(own)
     normals, height = g.directions, g.spacings / 2
@@ -118,7 +118,7 @@ def check_measures(check: Check, g: Rebuilt, positions: Doubts) -> None:
     planes, anchors = d.domain.wall_planes(-1 - d.neighbors[walls])
     height[walls] = ((anchors - d.points[g.owner[walls]]) * planes).sum(axis=1)
     loose = np.zeros(len(g.owner), bool)
-    if d.domain.cuts_cells:
+    if cut:
         # Faces of parts that the boundary has cut off from their generators are not on bisectors: their corners give
         # their places. Such a part lies at the boundary, and so does the cell that it belongs to.
         there = g.areas / np.maximum(g.measures, 1e-300)[:, None]
@@ -136,7 +136,7 @@ def check_measures(check: Check, g: Rebuilt, positions: Doubts) -> None:
     turned = across / g.spacings
     width = np.bincount(g.owner, doubts.measures + rounding + turned, n)
     _check_sum(check, g.owner, d.face_measures[:, None] * normals, width)
-    if d.domain.cuts_cells:  # corners alone give the places of cut faces
+    if cut:  # corners alone give the places of cut faces
         return
     if d.is_power and dim == 2:
         # A small cell may be far from its generator: one of its corners is the better origin. In 3D the device, too,
@@ -204,24 +204,20 @@ def _finish(check: Check, dtype: object = None, more: Callable[[Rebuilt], None] 
 def _check_structure(check: Check) -> None:
     """Check that the shapes of the arrays match, and check the graph."""
     d = check.diagram
-    dim, n = d.domain.dim, len(d.points)
-    m = len(d.neighbors)
-    check.shape("points", d.points, (n, dim))
-    check.shape("volumes", d.volumes, (n,))
-    check.shape("centroids", d.centroids, (n, dim))
-    check.shape("weights", d.weights, (n,))
+    dim, n, m, cut = d.domain.dim, len(d.points), len(d.neighbors), d.domain.cuts_cells
+    floats = {"points": (n, dim), "volumes": (n,), "centroids": (n, dim), "weights": (n,), "face_measures": (m,)}
+    floats |= {"face_centroids": (m, dim), "vertices": (len(d.vertices), dim)}
+    for name, shape in floats.items():
+        check.shape(name, getattr(d, name), shape)
     check.shape("neighbor_starts", d.neighbor_starts, (n + 1,), "iu")
     check.shape("neighbors", d.neighbors, (m,), "i")
     check.shape("shifts", d.shifts, (m, dim), "i")
-    check.shape("face_measures", d.face_measures, (m,))
-    check.shape("face_centroids", d.face_centroids, (m, dim))
-    check.shape("vertices", d.vertices, (len(d.vertices), dim))
     _check_starts(check, "neighbor_starts", d.neighbor_starts, m)
     if d.domain.cell_dim == 2:
         check.shape("cell_vertex_starts", d.cell_vertex_starts, (n + 1,), "iu")
         _check_starts(check, "cell_vertex_starts", d.cell_vertex_starts, len(d.cell_vertices))
         corners = d.cell_vertices
-        if d.domain.cuts_cells:
+        if cut:
             check.shape("face_vertex_starts", d.face_vertex_starts, (m + 1,), "iu")
             check.shape("face_vertices", d.face_vertices, (2 * m,), "iu")
             check.note(
@@ -263,7 +259,7 @@ def _check_structure(check: Check) -> None:
     _check_shifts(check)
     _check_graph(check)
     check_corners(check)
-    if d.domain.cuts_cells:
+    if cut:
         check_outlines(check)
 
 
@@ -370,9 +366,9 @@ def _check_geometry(check: Check, g: Rebuilt) -> None:
     # The error of a centroid is relative to the volume.
     doubt = slack + doubts.volumes * g.reach / np.maximum(g.volumes, 1e-300)
     check.compare("centroids", d.centroids, d.points + g.centroids, doubt)
-    if domain.outline is not None:
-        check_edges(check, domain.outline, g, slack)
-        check_cells(check, domain.outline, g, slack)
+    if (outline := domain.outline) is not None:
+        check_edges(check, outline, g, slack)
+        check_cells(check, outline, g, slack)
     _check_nearest(check, g, slack)
 
 
