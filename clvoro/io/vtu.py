@@ -1,7 +1,7 @@
 """Write VTK's XML format for unstructured grids (`.vtu`), for ParaView and similar programs.
 
-The arrays follow the XML as raw bytes ("appended" data), which are exact and compact. Before each array stands its
-length, or a table of its compressed blocks.
+The arrays follow the XML as compressed bytes ("appended" data), which are exact. Before each array stands a table of
+its blocks.
 """
 
 from __future__ import annotations
@@ -34,14 +34,14 @@ _BLOCK = 1 << 20
 _TYPES = {"f8": "Float64", "f4": "Float32", "i4": "Int32", "i8": "Int64", "u1": "UInt8"}
 
 
-def write_vtu(contents: Contents, path: Path, compress: bool = True, walls: WallShape = "exact") -> None:
+def write_vtu(contents: Contents, path: Path, walls: WallShape = "exact") -> None:
     """Write the cells as polygons or polyhedra with cell data.
 
     Cell data: `size` (h), `error` (signed) and `quality` of a result; `volume` (area in 2D); `sides` (in 3D
     `faces_of_cell`); `label` (row of the cell); `boundary` (see `largest_boundary`); for each name that the caller
     gave to a boundary `boundary:NAME` (1 where the cell has a face on it, else 0); the vector `generator`, from the
     origin to the cell's generator; in a power diagram `weight`; and data of the caller. A comment holds the settings,
-    field data the domain (JSON as bytes), and what is behind the faces on walls and at seams. In a periodic box cells
+    field data the domain (JSON as bytes), and what is behind each face. In a periodic box cells
     are not cut at the seams. On a sphere the corners of cells are on it, and VTK draws straight lines between them.
 
     With `walls` "straight" the cells are those of the solver mesh, with their volumes, and without the domain, as the
@@ -50,7 +50,7 @@ def write_vtu(contents: Contents, path: Path, compress: bool = True, walls: Wall
     check_choice("walls", walls, ("straight", "exact"))
     diagram = contents.diagram
     n = len(diagram)
-    appended = _Appended(compress)
+    appended = _Appended()
     mesh = make_solver_mesh(diagram) if walls == "straight" else None
     vertices = diagram.vertices if mesh is None else mesh.points
     points = appended.add(None, in_space(vertices))
@@ -65,10 +65,9 @@ def write_vtu(contents: Contents, path: Path, compress: bool = True, walls: Wall
     about = _diagram_data(diagram) if mesh is None else {}
     field = [appended.add(name, array, tuples=True) for name, array in about.items()]
     note = "" if mesh is None else _comment(SOLVER_MESH) + "\n"
-    compressor = ' compressor="vtkZLibDataCompressor"' if compress else ""
     head = f"""<?xml version="1.0"?>
 <VTKFile type="UnstructuredGrid" version="1.0" byte_order="{sys.byteorder.title()}Endian" \
-header_type="UInt64"{compressor}>
+header_type="UInt64" compressor="vtkZLibDataCompressor">
 {_comment("clvoro settings: " + json.dumps(contents.settings, default=repr))}
 {note}\
 <UnstructuredGrid>
@@ -109,7 +108,7 @@ def write_pvtu(contents: Contents, path: Path) -> None:
     write_piece() if parts is None else parts.together(write_piece)
     if number:
         return
-    declared = _Appended(compress=False)
+    declared = _Appended()
     # Elements without the places of bytes in a file.
     shapes = {name: a[:0] for name, a in cell_data(contents).items() if not name.startswith("boundary:")}
     data = [_PLACE.sub("", declared.add(name, a)).replace("DataArray", "PDataArray") for name, a in shapes.items()]
@@ -137,20 +136,12 @@ _PLACE = re.compile(' format="appended" offset="[0-9]*"')
 
 
 def _diagram_data(diagram: Diagram) -> dict[str, np.ndarray]:
-    """Return field data with the domain, and with what corners of cells do not define: the graph at walls and seams."""
-    about = np.frombuffer(json.dumps(describe(diagram.domain)).encode(), np.uint8)
-    written = KINDS[diagram.domain.cell_dim].written(diagram)
-    lone = diagram.neighbors < 0
+    """Return field data with the domain, and with what corners of cells do not define: the graph."""
+    written = np.diff(diagram.half_faces.corners[0]) > 0
+    found = {"domain": np.frombuffer(json.dumps(describe(diagram.domain)).encode(), np.uint8)}
+    found["neighbors"] = diagram.neighbors[written].astype(np.int32)
     if any(diagram.domain.periodic):
-        lone |= diagram.shifts.any(axis=1)
-    border = np.flatnonzero(written & lone)
-    found = {
-        "domain": about,
-        "border_faces": (np.cumsum(written) - 1)[border].astype(np.int32),
-        "border_neighbors": diagram.neighbors[border].astype(np.int32),
-    }
-    if any(diagram.domain.periodic):
-        found["border_shifts"] = in_space(diagram.shifts[border]).astype(np.int32)
+        found["shifts"] = in_space(diagram.shifts[written]).astype(np.int32)
     if diagram.domain.cuts_cells:
         found["bridges"] = _bridges(diagram)
     return found
@@ -235,16 +226,9 @@ def polyhedra(mesh: Diagram | Faces) -> dict[str, np.ndarray]:
     }
 
 
-def _every_face(diagram: Diagram) -> np.ndarray:
-    return np.ones(len(diagram.neighbors), bool)
-
-
-def _faces_with_corners(diagram: Diagram) -> np.ndarray:
-    return np.diff(diagram.half_faces.corners[0]) > 0
-
-
 def _count_faces(diagram: Diagram) -> np.ndarray:
-    return np.bincount(diagram.half_faces.owner[_faces_with_corners(diagram)], minlength=len(diagram))
+    written = np.diff(diagram.half_faces.corners[0]) > 0
+    return np.bincount(diagram.half_faces.owner[written], minlength=len(diagram))
 
 
 @dataclass(frozen=True)
@@ -259,14 +243,12 @@ class CellKind:
     """(str, str). Names of the arrays with the ends of the cells' parts and their items."""
     topology: Callable[[Diagram | Faces], dict[str, np.ndarray]]
     count: Callable[[Diagram], np.ndarray]
-    written: Callable[[Diagram], np.ndarray]
-    """`topology`, `count`, `written`: of a diagram: VTK's arrays (also of a mesh for solvers), numbers of sides or
-    faces, and which half-faces are written."""
+    """`topology`, `count`: of a diagram: VTK's arrays (also of a mesh for solvers), and numbers of sides or faces."""
 
 
 KINDS = {
-    2: CellKind(7, "sides", ("offsets", "connectivity"), _polygons, count_sides, _every_face),
-    3: CellKind(42, "faces_of_cell", ("faceoffsets", "faces"), polyhedra, _count_faces, _faces_with_corners),
+    2: CellKind(7, "sides", ("offsets", "connectivity"), _polygons, count_sides),
+    3: CellKind(42, "faces_of_cell", ("faceoffsets", "faces"), polyhedra, _count_faces),
 }
 """VTK's polygons and polyhedra, by the dimension of the cells."""
 
@@ -318,9 +300,8 @@ def in_space(points: np.ndarray) -> np.ndarray:
 class _Appended:
     """The appended bytes, and the XML elements that refer to them."""
 
-    def __init__(self, compress: bool) -> None:
+    def __init__(self) -> None:
         self.chunks: list[bytes] = []
-        self.compress = compress
         self._offset = 0
 
     def add(self, name: str | None, array: np.ndarray, tuples: bool = False) -> str:
@@ -331,14 +312,10 @@ class _Appended:
         components += f' NumberOfTuples="{len(data)}"' if tuples else ""
         kind = _TYPES[data.dtype.str[1:]]
         element = f'<DataArray type="{kind}"{label}{components} format="appended" offset="{self._offset}"/>'
-        chunk = _packed(data.tobytes()) if self.compress else _measured(data.tobytes())
+        chunk = _packed(data.tobytes())
         self.chunks.append(chunk)
         self._offset += len(chunk)
         return element
-
-
-def _measured(raw: bytes) -> bytes:
-    return struct.pack("=Q", len(raw)) + raw
 
 
 def _packed(raw: bytes) -> bytes:

@@ -60,9 +60,8 @@ _USED = {
     "CellData.sides",
     "CellData.faces_of_cell",
     "FieldData.domain",
-    "FieldData.border_faces",
-    "FieldData.border_neighbors",
-    "FieldData.border_shifts",
+    "FieldData.neighbors",
+    "FieldData.shifts",
     "FieldData.bridges",
 }
 
@@ -78,7 +77,6 @@ class FileReader:
         self.left = max(LEAST, EXPANSION * size)  # bytes that arrays may still expand to
         self.there = size  # bytes of the file that no array has used
         self.points = self.cells = -1
-        self.compressed = False
         self.entries: dict[str, tuple[str, int, int]] = {}
         self._within: list[str] = []
         parser = expat.ParserCreate()
@@ -110,10 +108,8 @@ class FileReader:
                 raise FileError(f"it is not an UnstructuredGrid in {native}")
             if given.get("header_type") != "UInt64":
                 raise FileError("its header_type is not UInt64")
-            compressor = given.get("compressor")
-            if compressor not in (None, "vtkZLibDataCompressor"):
-                raise FileError(f"its compressor is {compressor!r:.60}")
-            self.compressed = compressor is not None
+            if given.get("compressor") != "vtkZLibDataCompressor":
+                raise FileError(f"its compressor is {given.get('compressor')!r:.60}")
         elif tag == "Piece":
             self.points, self.cells = int(given["NumberOfPoints"]), int(given["NumberOfCells"])
         elif tag == "DataArray":
@@ -140,14 +136,9 @@ class FileReader:
         if not 0 <= offset <= self.size - self.start - 8:
             raise FileError(f"{name} is beyond the end of the file")
         file.seek(self.start + offset)
-        if self.compressed:
-            raw = bytearray()
-            for block in self._blocks(file, name):
-                raw += block
-        else:
-            (length,) = struct.unpack("=Q", file.read(8))
-            raw = self._take(file, name, length)
-        array = np.frombuffer(raw, kind)  # raises unless the length is a multiple of the item size
+        array = np.frombuffer(
+            b"".join(self._blocks(file, name)), kind
+        )  # raises unless the length is a multiple of the item size
         if width > 1:
             array = array.reshape(-1, width)
         rows = {"Points": self.points, "CellData": self.cells}.get(name.split(".")[0])
@@ -306,40 +297,18 @@ def _cell_polygons(arrays: Mapping[str, np.ndarray], v: int, domain: Domain) -> 
 
 
 def _graph(arrays: Mapping[str, np.ndarray], d: Diagram) -> dict[str, np.ndarray]:
-    """Return the neighbors: on walls and at seams those in the file, else the cells with a face of the same corners."""
-    starts, corners, owner = d.face_vertex_starts, d.face_vertices, d.half_faces.owner
-    walls, m = len(d.domain.boundary_index), len(starts) - 1
-    border = _indices(arrays["FieldData.border_faces"], m, "border_faces")
-    behind = _indices(arrays["FieldData.border_neighbors"] + walls, len(d) + walls, "border_neighbors") - walls
-    if len(border) != len(behind):
-        raise FileError("border_faces and border_neighbors differ in length")
-    sides = np.diff(starts)
-    face = np.repeat(np.arange(m), sides)
-    ragged = corners[np.lexsort((corners, face))]
-    inner = np.ones(m, bool)
-    inner[border] = False
-    neighbors = np.full(m, len(d))
-    neighbors[border] = behind
-    for k in np.unique(sides):
-        rows = np.flatnonzero((sides == k) & inner)
-        if k < 2:
-            raise FileError("a face has fewer than 2 corners")
-        keys = ragged[starts[rows][:, None] + np.arange(k)]
-        by = np.lexsort(keys.T[::-1])
-        same = (keys[by][1:] == keys[by][:-1]).all(axis=1)
-        a, b = rows[by[:-1][same]], rows[by[1:][same]]
-        neighbors[a], neighbors[b] = owner[b], owner[a]
-    alone = np.flatnonzero(neighbors == len(d))
-    if len(alone):
-        raise FileError(f"cell {owner[alone[0]]} has a face that is no other cell's")
-    if "FieldData.border_shifts" not in arrays:
-        return {"neighbors": neighbors}
-    steps = arrays["FieldData.border_shifts"]
-    if steps.shape != (len(border), 3) or (np.abs(steps.astype(float)) > 1).any():
-        raise FileError("its seams differ from its cells")
-    shifts = np.zeros((m, d.domain.dim), np.int8)
-    shifts[border] = steps[:, : d.domain.dim]
-    return {"neighbors": neighbors, "shifts": shifts}
+    """Return the neighbors, and in a periodic box the shifts."""
+    walls, m = len(d.domain.boundary_index), len(d.half_faces.owner)
+    found = {"neighbors": _indices(arrays["FieldData.neighbors"] + walls, len(d) + walls, "neighbors") - walls}
+    if any(d.domain.periodic):
+        shifts = arrays["FieldData.shifts"]
+        if shifts.shape[1:] != (3,) or (np.abs(shifts.astype(float)) > 1).any():
+            raise FileError("its shifts are other numbers than -1, 0 and 1 for each axis")
+        found["shifts"] = shifts[:, : d.domain.dim].astype(np.int8)
+    for name, rows in found.items():
+        if len(rows) != m:
+            raise FileError(f"its {name} are {len(rows)}, expected one for each of {m} faces")
+    return found
 
 
 def _indices(array: np.ndarray, bound: int, name: str) -> np.ndarray:
