@@ -202,25 +202,6 @@ class MeshState:
         start["ever_changed"] = self.engine.zeros(n)
         self.set_generators(start, first=True)
 
-    @classmethod
-    def create(
-        cls,
-        stages: Stages,
-        domain: Domain,
-        sizing: Sizing,
-        points: cla.Array,
-        labels: cla.Array | None = None,
-        size_factor: float = 1.0,
-        free: Domain | None = None,
-        fixed: int = 0,
-    ) -> MeshState:
-        """Return the mesh of `points` (n, d) in normalized coordinates; labels are 0, 1, ... by default."""
-        if labels is None:
-            labels = stages.engine.upload(np.arange(len(points)), np.int32)
-        none = np.empty((0, domain.dim))
-        setup = Setup(stages, domain, sizing, domain if free is None else free, fixed, none)
-        return cls(setup, size_factor, {"points": points, "labels": labels})
-
     def renewed(self) -> MeshState:
         """Return this mesh with everything computed anew from its `Arrays.kept`, as a resumed run does.
 
@@ -517,67 +498,72 @@ class MeshState:
 
         The number of generators changes towards `n_cells`, by default that of the size field, but not above `most`.
         """
-        # This takes more memory than a step.
-        self.engine.workspace.shrink()
-        with self.engine.workspace.frame():
+
+        def changed() -> Outcome | None:
             w = self.stages.density.cell_weights(self.t, self.h)
             missing = self.missing_cells(w) if n_cells is None else float(n_cells - self.total)
-            missing = min(missing, most - self.total)
+            change = Change(min(missing, most - self.total), nuclei, climb, climb_strain)
             sizes = CellSizes(self.h, self.local_length, w.log_ratio)
-            change = Change(missing, nuclei, climb, climb_strain)
-            new = self.stages.insertion_deletion.insert_delete(self.present, sizes, change)
-        rows, counts = _take_apart(new)
-        del new, w, sizes
-        return self._replace(rows, counts)
+            return self.stages.insertion_deletion.insert_delete(self.present, sizes, change)
+
+        return self._replace_by(changed)
 
     def repair_cells(self, deficit: float, split: bool) -> tuple[int, int]:
         """Delete or split the worst cells (see `InsertionDeletion.repair_cells`); return the numbers of both."""
-        self.engine.workspace.shrink()
-        new = self.stages.insertion_deletion.repair_cells(self.present, self.quality, deficit, split)
-        rows, counts = _take_apart(new)
-        del new
-        return self._replace(rows, counts)
+        insertion_deletion = self.stages.insertion_deletion
+        return self._replace_by(lambda: insertion_deletion.repair_cells(self.present, self.quality, deficit, split))
 
     def balance_counts(self) -> tuple[int, int]:
         """Insert and delete generators where parts of the domain have too few or too many; return the numbers of both.
 
         See `LocalCounts`.
         """
-        stages, engine, new = self.stages, self.engine, None
-        stages.clear_poisson()
-        engine.workspace.shrink()
-        with engine.workspace.frame():
+        stages, engine = self.stages, self.engine
+
+        def changed() -> Outcome | None:
             w = stages.density.cell_weights(self.t, self.h)
-            changes = engine.scratch(self.n, np.int32)
+            changes, new = engine.scratch(self.n, np.int32), None
             if stages.local_counts.choose(self, w, changes):
                 sites = (stages.local_counts.sites(changes, 1), stages.local_counts.sites(changes, -1))
                 new = stages.insertion_deletion.split_delete(self.present, sites)
+            stages.clear_poisson()
+            return new
+
         stages.clear_poisson()
-        rows, counts = _take_apart(new)
-        del new
-        return self._replace(rows, counts)
+        return self._replace_by(changed)
 
     def delete_squeezed(self) -> None:
         """Delete small cells between balls: generators that are squeezed between balls cannot move away."""
         if self.balls is None:
             return
         stages, engine = self.stages, self.engine
-        stages.clear_poisson()
-        engine.workspace.clear()
-        with engine.workspace.frame():
+
+        def changed() -> Outcome | None:
             ratio = stages.density.cell_weights(self.t, self.h).log_ratio.get()
             small = (ratio < engine.cell_dim * math.log(SQUEEZED)) & (self.labels.get() >= self.fixed)
+            if not small.any():
+                return None
             sites = engine.zeros(self.n, np.uint64), engine.upload(small, np.uint64)
-            new = None
-            if small.any():
-                new = stages.insertion_deletion.split_delete(self.present, sites)
-        rows, counts = _take_apart(new)
-        del new
-        self._replace(rows, counts)
+            return stages.insertion_deletion.split_delete(self.present, sites)
 
-    def _replace(self, rows: dict[str, cla.Array], counts: tuple[int, int]) -> tuple[int, int]:
-        """Replace the generators by `rows`, if there are any; return the numbers of insertions and deletions."""
-        self.engine.workspace.shrink()
+        stages.clear_poisson()
+        engine.workspace.clear()
+        self._replace_by(changed)
+
+    def _replace_by(self, changed: Callable[[], Outcome | None]) -> tuple[int, int]:
+        """Replace the generators by those that `changed` returns, if any; return the numbers of new and deleted ones.
+
+        That takes more memory than a step.
+        """
+        rows, counts, workspace = {}, (0, 0), self.engine.workspace
+        workspace.shrink()
+        with workspace.frame():
+            new = changed()
+            if new is not None:
+                # By name, so that each array can be freed on its own.
+                rows, counts = dict(vars(new.generators)), (new.inserted, new.deleted)
+            del new
+        workspace.shrink()
         self.stages.insertion_deletion.clear()
         if rows:
             self.set_generators(rows, inserted=counts[0])
@@ -683,10 +669,3 @@ class MeshState:
             return fetch_part(engine, self.domain, latest.pop(), self.labels)
         # No list or frame here holds the cells any longer: a solid frees them before it makes others.
         return fetch_diagram(engine, self.domain, latest.pop(), self.labels, copy=False, held=held)
-
-
-def _take_apart(new: Outcome | None) -> tuple[dict[str, cla.Array], tuple[int, int]]:
-    """Return the arrays of the new generators by name, so that each can be freed on its own, and the numbers."""
-    if new is None:
-        return {}, (0, 0)
-    return dict(vars(new.generators)), (new.inserted, new.deleted)

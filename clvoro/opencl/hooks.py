@@ -9,7 +9,6 @@ profiles, and runs without one are not slower.
 from __future__ import annotations
 
 import threading
-from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, Protocol
@@ -30,42 +29,6 @@ class Watcher(Protocol):
     def __call__(self, event: cl.Event, stage: str, name: str, moved: int | None, done: bool = False) -> None:
         """Take one event."""
         ...
-
-
-class Tally:
-    """A watcher that counts commands.
-
-    - `calls`, `bytes` Counter of (str, str): number of commands, and their bytes if known, per stage and kernel.
-    """
-
-    def __init__(self) -> None:
-        self.calls: Counter[tuple[str, str]] = Counter()
-        self.bytes: Counter[tuple[str, str]] = Counter()
-
-    def __call__(self, event: cl.Event, stage: str, name: str, moved: int | None, done: bool = False) -> None:
-        """Count one command."""
-        self.calls[stage, name] += 1
-        self.bytes[stage, name] += moved or 0
-
-    @property
-    def launches(self) -> int:
-        """Number of commands that work on the device: kernels, copies and fills."""
-        return sum(self.calls.values()) - self.reads - self.writes
-
-    @property
-    def reads(self) -> int:
-        """Number of reads by the host. It waits for each."""
-        return self.calls[MEMORY, "read"]
-
-    @property
-    def writes(self) -> int:
-        """Number of writes by the host. It waits for each."""
-        return self.calls[MEMORY, "write"]
-
-    @property
-    def bytes_read(self) -> int:
-        """Number of bytes that the host reads."""
-        return self.bytes[MEMORY, "read"]
 
 
 _watched: list[tuple[cl.CommandQueue, Watcher]] = []

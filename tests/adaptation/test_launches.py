@@ -11,11 +11,12 @@ import clvoro
 from clvoro.adaptation.plan.actions import Step
 from clvoro.adaptation.plan.schedule import adaptive_schedule
 from clvoro.adaptation.stages import Stages
-from clvoro.adaptation.state import MeshState
 from clvoro.opencl.engine import Engine
-from clvoro.opencl.hooks import Tally, watching
+from clvoro.opencl.hooks import watching
 from clvoro.sizing import Sizing
+from tests.reference import patch
 from tests.robustness.gpu_like import groups
+from tests.tally import Tally
 
 WARM_UP, STEPS = 4, 2
 FEW = 4000
@@ -78,7 +79,7 @@ def check_steps(adapter, dim, n, group):
     engine._divides = False
     for method in methods(dim):
         tally, reads, iterations = Tally(), [], 0
-        mesh = MeshState.create(Stages(engine), box, Sizing(engine, box, spacing), engine.upload(points))
+        mesh = patch.make_mesh(Stages(engine), box, Sizing(engine, box, spacing), engine.upload(points))
         for k in range(WARM_UP + STEPS):
             with watching(engine.queue, tally) if k >= WARM_UP else watching(engine.queue, Tally()):
                 before = tally.reads

@@ -9,10 +9,10 @@ from clvoro.adaptation import local_counts
 from clvoro.adaptation.plan.actions import BalanceCounts, Refine, RepairCells
 from clvoro.adaptation.plan.schedule import adaptive_schedule
 from clvoro.adaptation.stages import Stages
-from clvoro.adaptation.state import MeshState
 from clvoro.opencl.engine import Engine
 from clvoro.sizing import Sizing, as_field
 from tests.reference import local_counts as reference
+from tests.reference import patch
 
 H = 0.1
 LEFT, RIGHT, APART = (0.0, 0.0), (1.4, 0.0), (3.0, 0.0)
@@ -42,7 +42,7 @@ def make_mesh(ctx, domain, points, fixed=0, real=np.float64):
     engine = Engine(ctx, cl.CommandQueue(ctx), 2, np.dtype(real), domain.traits(np.dtype(real)))
     on_device = engine.upload(domain.place(points, engine.real))
     sizing = Sizing(engine, domain, as_field(H))
-    return MeshState.create(Stages(engine), domain, sizing, on_device, fixed=fixed)
+    return patch.make_mesh(Stages(engine), domain, sizing, on_device, fixed=fixed)
 
 
 def chosen(mesh):

@@ -14,7 +14,6 @@ from clvoro.adaptation.methods import (
     make_method,
 )
 from clvoro.adaptation.stages import Stages
-from clvoro.adaptation.state import MeshState
 from clvoro.adaptation.tuning import AT_WALLS_OF_BOXES, PENALTY_PER_ERROR
 from clvoro.errors import SizeErrorWarning, SizeFieldError
 from clvoro.sizing import Sizing
@@ -34,7 +33,7 @@ def stages(ctx):
 def make_mesh(stages, points=None, field=FIELD):
     points = patch.relaxed_points(N, 5005, steps=2) if points is None else points
     engine = stages.engine
-    mesh = MeshState.create(stages, patch.BOX, Sizing(engine, patch.BOX, field), engine.upload(points))
+    mesh = patch.make_mesh(stages, patch.BOX, Sizing(engine, patch.BOX, field), engine.upload(points))
     return mesh, patch.fetch(mesh.t)
 
 
@@ -211,7 +210,7 @@ def test_mean_log_ratio_error_of_perfect_cells(stages):
 def test_updates_check_sizes(stages):
     engine, good = stages.engine, np.array([[0.2, 0.3], [0.6, 0.6], [0.5, 0.1]])
     size = Sizing(engine, patch.BOX, sizing.Expression("x > 0.7 ? 0.0/0.0 : 0.05"))
-    mesh = MeshState.create(stages, patch.BOX, size, engine.upload(good), size_factor=4)
+    mesh = patch.make_mesh(stages, patch.BOX, size, engine.upload(good), size_factor=4)
     first = mesh.summaries.read()["error"].magnitude
     assert first > 0
     mesh.points.set(np.array([[0.2, 0.3], [0.8, 0.6], [0.5, 0.1]]))

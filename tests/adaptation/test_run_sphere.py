@@ -11,8 +11,8 @@ from scipy.spatial import KDTree
 import clvoro
 from clvoro import earth, sizing
 from clvoro.adaptation.stages import Stages
-from clvoro.adaptation.state import MeshState
 from clvoro.opencl.engine import Engine
+from tests.reference import patch
 from tests.reference.spheres import SphericalDiagram
 
 EARTH = clvoro.Sphere()
@@ -110,7 +110,7 @@ def test_obtuse_triangles_are_opened(ctx, real):
     engine = Engine(ctx, cl.CommandQueue(ctx), 3, np.dtype(real), EARTH.traits(np.dtype(real)))
     on_device = engine.upload(EARTH.place(points, engine.real))
     field = sizing.Sizing(engine, EARTH, sizing.as_field(1e6))
-    mesh = MeshState.create(Stages(engine), EARTH, field, on_device)
+    mesh = patch.make_mesh(Stages(engine), EARTH, field, on_device)
     d = clvoro.Adapter(ctx).diagram(EARTH, points)
     x, expected = points / EARTH.radius, np.zeros((500, 3))
     count = 0

@@ -6,7 +6,6 @@ import pytest
 
 import clvoro
 from clvoro.adaptation.stages import Stages
-from clvoro.adaptation.state import MeshState
 from clvoro.adaptation.thin_walls import has_thin_walls
 from clvoro.opencl.engine import Engine
 from clvoro.sizing import Sizing, as_field
@@ -70,7 +69,7 @@ def test_pairs(ctx, real, half):
     rng = np.random.default_rng(7)
     x = (np.indices((10, 10)).reshape(2, -1).T + 0.5) / 10 + rng.uniform(-0.03, 0.03, (100, 2))
     engine = Engine(ctx, cl.CommandQueue(ctx), 2, np.dtype(real), domain.traits(np.dtype(real)))
-    mesh = MeshState.create(
+    mesh = patch.make_mesh(
         Stages(engine), domain, Sizing(engine, domain, as_field(H)), engine.upload(domain.place(x, engine.real))
     )
     origin, scale = domain.frame
@@ -108,7 +107,7 @@ def test_sides_of_unlike_size_have_no_pairs(ctx):
     moved = []
     for ratio in (1.1, 1.2):
         size = as_field(clvoro.sizing.Expression(f"x < 0.5 ? {H} : {H * ratio}"))
-        mesh = MeshState.create(
+        mesh = patch.make_mesh(
             Stages(engine), SLIT, Sizing(engine, SLIT, size), engine.upload(SLIT.place(x, engine.real))
         )
         before = mesh.points.get()

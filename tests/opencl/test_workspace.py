@@ -10,7 +10,6 @@ import pytest
 from clvoro import sizing
 from clvoro.adaptation.methods import ProjectedMethod, PublishedMethod, Relaxation, WeightedMethod
 from clvoro.adaptation.stages import Stages
-from clvoro.adaptation.state import MeshState
 from clvoro.errors import MemoryLimitError
 from clvoro.opencl import memory_limits, primitives
 from clvoro.opencl.engine import Engine
@@ -184,7 +183,7 @@ def test_steps_allocate_nothing(engine, made, method):
     """After two similar steps, a step of displacement, motion, update of the diagram and quality allocates nothing."""
     field = sizing.Expression("0.05 + 0.02 * x")
     points = engine.upload(patch.relaxed_points(500, 3) / patch.BOX.frame[1])
-    mesh = MeshState.create(Stages(engine), patch.BOX, sizing.Sizing(engine, patch.BOX, field), points)
+    mesh = patch.make_mesh(Stages(engine), patch.BOX, sizing.Sizing(engine, patch.BOX, field), points)
     counts = []
     for _ in range(7):
         with engine.workspace.frame():
@@ -200,7 +199,7 @@ def test_search_for_flaws_frees_its_memory(engine, made, monkeypatch):
     monkeypatch.setattr(primitives, "KEPT", 0)
     size = sizing.Sizing(engine, patch.BOX, sizing.Constant(0.05))
     points = engine.upload(patch.relaxed_points(1200, 3) / patch.BOX.frame[1])
-    mesh = MeshState.create(Stages(engine), patch.BOX, size, points)
+    mesh = patch.make_mesh(Stages(engine), patch.BOX, size, points)
     mesh.fixed, before = mesh.n, len(made)  # all stay where they are
     assert mesh.repair_cells(deficit=0.06, split=False) == (0, 0)
     assert len(made) > before  # it has looked
@@ -222,7 +221,7 @@ def test_released_stages_leave_no_memory(engine, monkeypatch):
     gc.disable()
     try:
         size = sizing.Sizing(engine, patch.BOX, sizing.Constant(0.05))
-        mesh = MeshState.create(stages, patch.BOX, size, engine.upload(host))
+        mesh = patch.make_mesh(stages, patch.BOX, size, engine.upload(host))
         for method in (PublishedMethod(Relaxation(), True, True), WeightedMethod(), ProjectedMethod()):
             with engine.workspace.frame():
                 mesh.move(method.step(mesh))

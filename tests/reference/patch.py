@@ -8,6 +8,7 @@ import numpy as np
 import pyopencl as cl
 
 from clvoro.adaptation.stages import Stages
+from clvoro.adaptation.state import MeshState, Setup
 from clvoro.adaptation.tuning import SHORT_FACE
 from clvoro.geometry.box import Box
 from clvoro.opencl.engine import Engine
@@ -36,6 +37,13 @@ def make_engine(ctx, real="float64", dim=2, group_size=None, box=BOX):
     if group_size is not None:
         object.__setattr__(engine, "group_size", group_size)
     return engine
+
+
+def make_mesh(stages, domain, sizing, points, size_factor=1.0, fixed=0):
+    """Return the mesh of `points` (n, d) on the device, in normalized coordinates."""
+    setup = Setup(stages, domain, sizing, domain, fixed, np.empty((0, domain.dim)))
+    labels = stages.engine.upload(np.arange(len(points)), np.int32)
+    return MeshState(setup, size_factor, {"points": points, "labels": labels})
 
 
 def tessellate(engine, points, box=BOX):

@@ -14,13 +14,14 @@ from clvoro.errors import BuildError
 from clvoro.opencl import engine as engine_module
 from clvoro.opencl import program, ranges
 from clvoro.opencl.engine import Engine
-from clvoro.opencl.hooks import Tally, watching
+from clvoro.opencl.hooks import watching
 from clvoro.tessellation import back_ends
 from clvoro.tessellation.bins import Bins
 from clvoro.tessellation.part import Part
 from clvoro.tessellation.polyhedra import Polyhedra
 from tests.reference.diagrams3d import directions
 from tests.robustness.gpu_like import by_teams, groups
+from tests.tally import Tally
 from tests.tessellation.test_polyhedra import BOX, POINTS
 
 ARRAYS = ("starts", "neighbors", "face_measures", "face_centroids", "volumes", "offsets", "covariances")

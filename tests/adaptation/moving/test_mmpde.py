@@ -8,7 +8,6 @@ from clvoro import sizing
 from clvoro.adaptation.moving.lattice import lattice_points
 from clvoro.adaptation.moving.mmpde import LONGEST, RATE, ROOM, MmpdeMethod, connect
 from clvoro.adaptation.stages import Stages
-from clvoro.adaptation.state import MeshState
 from clvoro.errors import TangledMeshWarning
 from clvoro.sizing import Sizing
 from tests.reference import moving, patch, runs
@@ -25,7 +24,7 @@ def make_mesh(ctx, dim, real="float64", shift=0.0):
     points = lattice + np.random.default_rng(11).uniform(-shift, shift, lattice.shape) * spacing
     engine = patch.make_engine(ctx, real, dim, box=box)
     size = Sizing(engine, box, sizing.Expression(FIELDS[dim]))
-    mesh = MeshState.create(Stages(engine), box, size, engine.upload(points))
+    mesh = patch.make_mesh(Stages(engine), box, size, engine.upload(points))
     order = mesh.labels.get()
     return mesh, lattice[order], points[order]
 
