@@ -130,7 +130,7 @@ def measure_rank(options: argparse.Namespace) -> None:
     memory_limits.MOST_TAKEN.clear()
     mesh, spent, waits = run(adapter, h)
     began = time.process_time()
-    _ = mesh.diagram.vertices
+    _ = [getattr(mesh.diagram, name) for name in clvoro.Diagram._NAMES if name in dir(mesh.diagram)]
     reading = comm.allreduce(time.process_time() - began)
     taken = comm.allreduce(max(memory_limits.MOST_TAKEN.values()), MPI.MAX)
     steps = int(mesh.history["step"][-1])

@@ -14,7 +14,7 @@ from ..geometry.domain import Domain
 from ..geometry.sphere import COAST, Sphere, SphereRegion
 from ..geometry.subdomain import Subdomain
 from ..geometry.surface import Surface
-from .connectivity import take_rows
+from .connectivity import take_rows, used_indices
 from .diagram import Diagram
 from .results import HISTORY_DTYPE, Result, figures
 
@@ -152,8 +152,8 @@ def _arrays(d: Diagram, kept: np.ndarray, faces: np.ndarray, neighbors: np.ndarr
         if starts in d._arrays:
             arrays[starts], items = take_rows(getattr(d, starts), getattr(d, _CORNERS[name]), own)
             arrays[starts], corners[name] = arrays[starts].astype(np.int32), items
-    used, renumbered = np.unique(np.concatenate([*corners.values()]), return_inverse=True)
-    parts = np.split(renumbered.ravel().astype(np.int32), np.cumsum([len(c) for c in corners.values()])[:-1])
+    used, renumbered = used_indices(np.concatenate([*corners.values()]), len(d.vertices))
+    parts = np.split(renumbered, np.cumsum([len(c) for c in corners.values()])[:-1])
     arrays |= {_CORNERS[name]: part for name, part in zip(corners, parts, strict=True)}
     return {**arrays, "vertices": d.vertices[used]}
 

@@ -64,7 +64,7 @@ class Aggregates:
     """A partition of the cells of a graph."""
 
     aggregate: cla.Array
-    """(n or more,) int32. Number of the aggregate of each cell, then of each cell of other parts."""
+    """(n,) int32. Number of the aggregate of each cell, then of each cell of other parts."""
     starts: cla.Array
     """(aggregates + 1,) int32."""
     members: cla.Array
@@ -74,6 +74,11 @@ class Aggregates:
 
     def __len__(self) -> int:
         return len(self.starts) - 1
+
+    @property
+    def count(self) -> int:
+        """Number of aggregates, with those of other parts."""
+        return len(self) + (0 if self.ghosts is None else len(self.ghosts.parts))
 
 
 @dataclass(frozen=True)
@@ -292,14 +297,16 @@ class Aggregation:
     def _compose(self, inner: Aggregates, outer: Aggregates, level: int) -> Aggregates:
         """Return the aggregates of two passes, as a partition of the cells."""
         room = self._room
-        n, count = len(inner.members), len(outer)
+        n, rows, count = len(inner.members), len(inner.aggregate), len(outer)
         both = Aggregates(
-            room(level, "aggregate", size=n, dtype=np.int32),
+            room(level, "aggregate", size=rows, dtype=np.int32),
             room(level, "starts", size=count + 1, dtype=np.int32),
             room(level, "members", size=n, dtype=np.int32),
             outer.ghosts,
         )
-        self._run(self._kernels.compose_aggregates, n, np.int32(n), inner.aggregate, outer.aggregate, both.aggregate)
+        self._run(
+            self._kernels.compose_aggregates, rows, np.int32(rows), inner.aggregate, outer.aggregate, both.aggregate
+        )
         lists = (outer.starts, outer.members, inner.starts, inner.members, both.starts)
         self._list(self._kernels.compose_members, count, lists, both.starts, both.members)
         return both

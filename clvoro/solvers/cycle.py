@@ -11,6 +11,7 @@ import numpy as np
 import pyopencl as cl
 import pyopencl.array as cla
 
+from ..opencl.device_array import buffer_of
 from ..opencl.engine import Engine
 from ..opencl.kernels import bind, comparison_key, fit_group
 from ..opencl.launch import one_group_limit
@@ -46,6 +47,10 @@ class Cycle:
     All coarse levels of few cells take one launch of one work-group. On GPUs a finer level takes four: two steps
     of smoothing from zero; restriction of the defect; prolongation and a step; the last step. On CPUs it takes ten,
     because evaluating values several times costs more there than storing them. All have the same bits.
+
+    Over several parts the finest level has three exchanges, and each coarser one two: after smoothing, on the way down
+    and on the way up. The second of two steps takes the values of other parts' cells there as they were. So the
+    smoother is that of the part's own block of A, of which twice as much is more than A: S A stays below 2.
 
     - `merged`: whether a launch does several steps.
     """
@@ -96,8 +101,7 @@ class Cycle:
         finest = [r, u, work] if in_place else self._make_vectors(0)
         self._vectors = [finest, *(self._make_vectors(depth) for depth in range(1, len(levels)))]
         if self._rest is not None and levels[-1].aggregates is not None:
-            count = len(levels[-1].aggregates)
-            self._vectors.append([self._room("rest", name, size=count) for name in "bx"])
+            self._vectors.append([self._room("rest", name, size=levels[-1].aggregates.count) for name in "bx"])
         if not in_place:
             self._add(0, "take_residual", len(levels[0]), r, finest[0])
         # Levels that are smoothed by launches of their own.
@@ -152,6 +156,10 @@ class Cycle:
             self._add(depth, "smooth_pairs_from_zero", n, _LATE, _EARLY, *rows, *blocks, b, x)
         else:
             self._add(depth, "smooth_from_zero", n, _LATE, *blocks, b, x)
+            if depth:
+                self._forget(depth)
+            else:
+                self._fill(depth)
             self._smooth(depth, _EARLY)
         if level.aggregates is None:
             return
@@ -160,15 +168,27 @@ class Cycle:
         if self.merged:
             self._add(depth, "restrict_new_defect", count, np.int32(n), *rows, b, x, *lists)
         else:
+            self._fill(depth)
             self._compute_defect(depth)
             self._add(depth, "restrict_defect", count, t, *lists)
 
     def _compute_defect(self, depth: int) -> None:
-        """Set t = b - A x, after other parts have sent the values of x of their cells."""
+        """Set t = b - A x, with the values of x that are known of cells of other parts."""
         graph, (b, x, t) = self._levels[depth].graph, self._vectors[depth]
-        if graph.ghosts is not None:
-            self._launches.append(partial(graph.ghosts.fill, self.engine, len(graph), x))
         self._add(depth, "compute_defect", len(graph), *graph.rows, b, x, t)
+
+    def _forget(self, depth: int) -> None:
+        """Set the solution in cells of other parts to zero."""
+        (_, x, _), n = self._vectors[depth], len(self._levels[depth])
+        if len(x) > n:
+            given = self.engine.queue, buffer_of(x), np.float32(0), 4 * n, x.nbytes - 4 * n
+            self._launches.append(partial(cl.enqueue_fill_buffer, *given))
+
+    def _fill(self, depth: int) -> None:
+        """Get the solution in cells of other parts."""
+        graph = self._levels[depth].graph
+        if graph.ghosts is not None:
+            self._launches.append(partial(graph.ghosts.fill, self.engine, len(graph), self._vectors[depth][1]))
 
     def _solve_coarse(self, depth: int) -> None:
         """Do the cycle from `depth` on by one work-group."""
@@ -221,9 +241,13 @@ class Cycle:
             correction = level.aggregates.aggregate, self._vectors[depth + 1][1]
         if not self.merged:
             if correction:
-                self._add(depth, "prolong", n, *correction, x)
+                self._add(depth, "prolong", level.graph.count, *correction, x)
             self._smooth(depth, _EARLY)
+            if depth == 0:
+                self._fill(depth)
             self._smooth(depth, _LATE)
+            if depth:
+                self._fill(depth)
             return
         given = *level.graph.rows, *level.pairs.blocks, b
         name = "prolong_and_smooth_pairs" if correction else "smooth_pairs"

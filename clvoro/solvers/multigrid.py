@@ -7,10 +7,8 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-import pyopencl as cl
 import pyopencl.array as cla
 
-from ..opencl.device_array import buffer_of
 from ..opencl.engine import Engine
 from ..opencl.primitives import NamedArrays
 from .aggregation import Aggregation, Graph
@@ -21,7 +19,7 @@ if TYPE_CHECKING:
 
 _COARSEST = 64
 """Cells of the coarsest level, at most, if it is solved exactly."""
-GATHERED = 30_000
+GATHERED = 5_000
 """Largest number of cells, over all parts, of a level that each part holds whole: all parts then do the same work."""
 _MAX_LEVELS = 30
 _LEAST_COARSENING = 0.8
@@ -47,8 +45,9 @@ class Multigrid:
     within [0, 1], and C is positive semidefinite, however much it overshoots. A level visited twice, 2 C - C A C, is
     not: with scaled weights C A can exceed 2 where weights vary strongly. Hence the V-cycle.
 
-    Over several parts each aggregate has cells of one part, and each smoothing step needs values of the others. From
-    the first level of at most `GATHERED` cells on, each part has the whole levels and does the same work there.
+    Over several parts each aggregate has cells of one part, and smoothing needs values of the others; see `Cycle`. From
+    the first level of at most `GATHERED` cells on, each part has the whole levels and does the same work there. With
+    k coarser levels in parts, an iteration takes 5 + 2 k exchanges.
     """
 
     def __init__(self, engine: Engine) -> None:
@@ -129,11 +128,10 @@ class Multigrid:
         b_of_all, x_of_all, work = (self._room("whole", name, size=int(sizes.sum())) for name in "bxt")
 
         def solve(b: cla.Array, x: cla.Array) -> None:
-            own = b.get().astype(np.float32)
+            own = b.get()[:n].astype(np.float32)
             b_of_all.set(np.concatenate(peers.exchange([own] * peers.count, sizes)))
             whole.apply(b_of_all, x_of_all, work)
-            if n:
-                cl.enqueue_copy(engine.queue, buffer_of(x), buffer_of(x_of_all), byte_count=4 * n, src_offset=4 * first)
+            x.set(x_of_all.get()[rows[: len(x)]])
 
         return solve
 

@@ -228,8 +228,13 @@ def test_the_poisson_equation_in_two_halves(ctx, dim, real, from_zero, gathered,
             matrix = poisson.assemble(t.starts, t.neighbors, t.face_measures, part.points, part=part)
             phi, rhs = (engine.upload(values[rows[: t.n]]) for values in (start, source))
             given = {"tolerance": tolerance, "preconditioner": preconditioner, "from_zero": from_zero}
+            if gathered and part.peers:
+                levels, before = poisson.set_up_multigrid(matrix).sizes, engine.peers.exchanges
             solution = poisson.solve(matrix, rhs, phi, **given)
             assert solution.converged
+            if gathered and part.peers:
+                most = 5 + 2 * (len(levels) - 1) if levels else 2
+                assert engine.peers.exchanges - before <= most * (solution.iterations + 1)
             return phi.get(), solution.iterations
 
     (whole, count), two = halves.run(work)
