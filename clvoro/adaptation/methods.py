@@ -19,6 +19,7 @@ from typing import Literal
 
 import numpy as np
 import pyopencl as cl
+import pyopencl.array as cla
 
 from ..opencl.device_array import buffer_of
 from ..solvers.components import balance_components
@@ -208,30 +209,11 @@ class ProjectedMethod(Method):
             if self.error_target and self.steps > 2:
                 self._control_penalty(mesh.mean_log_ratio_error(w))
             self.steps += 1
-            penalty = self.penalty
-            if self.careful:
-                beyond = mesh.mean_log_ratio_error(w) - MET_ERROR
-                penalty = max(penalty, EXACT_PENALTY_PER_ERROR * beyond)
-            scale = self.log_ratio_scale
-            if self.scale_per_error:
-                scale = max(scale, self.scale_per_error * mesh.mean_log_ratio_error(w) - 3 * scale)
+            penalty = self._penalty_for(mesh, w)
             if self.gradient_from_field:
                 sizes = engine.scratch(mesh.n)
                 mesh.sizing.evaluate_with_gradient(mesh.points, mesh.n, sizes, gradient)
-            if self.descent == "surface" and t.vertices:
-                stages.surface_descent.descend(
-                    t, mesh.local_length, mesh.quality, lloyd, bad_cell_weight=self.bad_cell_weight, rate=self.rate
-                )
-            elif self.descent in ("quality", "edges"):
-                stages.quality_descent.descend(
-                    t,
-                    mesh.local_length,
-                    mesh.quality,
-                    lloyd,
-                    quality_weight=float(self.descent == "quality"),
-                    bad_cell_weight=bad_cell_weight,
-                    rate=self.rate,
-                )
+            self._descend(mesh, lloyd, bad_cell_weight)
             if still:
                 lloyd.fill(0)
             else:
@@ -241,13 +223,12 @@ class ProjectedMethod(Method):
         warm = mesh.multipliers is not None
         if not warm:
             mesh.multipliers = engine.zeros(mesh.n, np.float32)
-        at_walls, most = (AT_WALLS, MOST_AT_WALLS) if mesh.domain.cuts_cells else (AT_WALLS_OF_BOXES, math.inf)
         solution = stages.volume_projection.project(
             t,
             Targets(mesh.local_length, gradient, log_ratio, mesh.quality, sums),
             lloyd,
             correction,
-            Penalty(penalty, self.quality_scale, scale, at_walls, self.power, most),
+            penalty,
             Limits(self.tolerance, self.iterations),
             labels=mesh.labels,
             fixed=mesh.fixed,
@@ -256,6 +237,26 @@ class ProjectedMethod(Method):
         )
         mesh.summarize_displacements(lloyd, correction)
         return Displacement(lloyd, correction, mesh.local_length, bound=self.k, solution=solution)
+
+    def _penalty_for(self, mesh: MeshState, w: CellWeights) -> Penalty:
+        """Return the penalty for the present errors of the sizes."""
+        penalty, scale = self.penalty, self.log_ratio_scale
+        if self.careful:
+            beyond = mesh.mean_log_ratio_error(w) - MET_ERROR
+            penalty = max(penalty, EXACT_PENALTY_PER_ERROR * beyond)
+        if self.scale_per_error:
+            scale = max(scale, self.scale_per_error * mesh.mean_log_ratio_error(w) - 3 * scale)
+        at_walls, most = (AT_WALLS, MOST_AT_WALLS) if mesh.domain.cuts_cells else (AT_WALLS_OF_BOXES, math.inf)
+        return Penalty(penalty, self.quality_scale, scale, at_walls, self.power, most)
+
+    def _descend(self, mesh: MeshState, lloyd: cla.Array, bad_cell_weight: float) -> None:
+        """Write the descent of the cells' quality or of short edges to `lloyd`, if it is not Lloyd's."""
+        stages, t, cells = mesh.stages, mesh.t, (mesh.local_length, mesh.quality)
+        if self.descent == "surface" and t.vertices:
+            stages.surface_descent.descend(t, *cells, lloyd, bad_cell_weight=self.bad_cell_weight, rate=self.rate)
+        elif self.descent in ("quality", "edges"):
+            weights = {"quality_weight": float(self.descent == "quality"), "bad_cell_weight": bad_cell_weight}
+            stages.quality_descent.descend(t, *cells, lloyd, **weights, rate=self.rate)
 
     def _control_penalty(self, error: float) -> None:
         """Change the penalty towards the one that gives the error target."""

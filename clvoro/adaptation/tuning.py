@@ -120,7 +120,10 @@ MOST_AT_WALLS = 0.4
 CALM_MOMENTUM, CALM_BAD_CELL_WEIGHT = 0.7, 20.0
 """Largest parameters at thin walls, where larger steps part the pairs of generators."""
 FULL_RATE = 5.0
-"""Largest omega h^2 / A up to which a generator moves at the full rate; h^2 / A is 1.15 where a cell has its size."""
+"""Largest omega h^2 / A of a cell and its neighbors up to which a generator moves at the full rate of the descent of
+quality; beyond it the rate is smaller in proportion. h^2 / A is 1.15 where a cell has its size."""
+LONGEST_DESCENT = 0.2
+"""Largest displacement by the descent of quality."""
 OPENINGS, MOST_OBTUSE = 12, 0.02
 """Most times that obtuse triangles are opened, and their number per cell beyond which they are left."""
 STRIDE = 2.0

@@ -14,7 +14,7 @@ from ...opencl.device_array import read_number
 from ...opencl.engine import Engine
 from ...opencl.primitives import Scan
 from ...tessellation.device_diagram import Tessellation
-from ..tuning import FULL_RATE
+from ..tuning import FULL_RATE, LONGEST_DESCENT
 
 
 @dataclass(frozen=True)
@@ -54,21 +54,15 @@ class QualityDescent:
         quality_weight: float = 1.0,
         bad_cell_weight: float = 5.0,
         rate: float = 0.1,
-        max_displacement: float = 0.2,
-        edges: Repulsion = SHORT_EDGES,
-        pairs: Repulsion = CLOSE_PAIRS,
-        full_rate: float = FULL_RATE,
     ) -> None:
         """Write the displacement ``-rate h^2 dE/dx`` to `lloyd` (n, 2), in place of the displacement to the centroid.
+
+        It is at most `LONGEST_DESCENT` h. Beyond `FULL_RATE` the rate is smaller.
 
         - `h`, `quality`: (n,) real
         - `quality_weight`, `bad_cell_weight`: the weight of a cell is omega = quality_weight (1 - bad_cell_weight log
           Q).
         - `rate`: step length.
-        - `max_displacement`: largest displacement over h.
-        - `edges`, `pairs`: energies of the ends of edges, and of neighboring generators.
-        - `full_rate`: largest omega h^2 / A of a cell and its neighbors up to which its generator moves at the full
-          rate; beyond it the rate is smaller in proportion.
         """
         engine, k, real = self.engine, self._kernels, self.engine.real.type
         with engine.workspace.frame():
@@ -79,8 +73,9 @@ class QualityDescent:
             engine.run(k.compute_cell_forces, -(-t.n // 4), np.int32(t.n), *cells, *weights, forces)
             t.forward(engine, forces)
             faces = *rows.graph, rows.face_measures, rows.face_centroids
+            edges, pairs = SHORT_EDGES, CLOSE_PAIRS
             repulsions = edges.length, edges.stiffness, pairs.length, pairs.stiffness
-            limits = map(real, (rate, max_displacement, *repulsions, full_rate))
+            limits = map(real, (rate, LONGEST_DESCENT, *repulsions, FULL_RATE))
             moved = lloyd, *t.outlines, *engine.period_args
             engine.run_each(k.descend_quality, t.n, *faces, t.points, forces, *limits, *moved)
 

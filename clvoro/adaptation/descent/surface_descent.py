@@ -6,6 +6,7 @@ import pyopencl.array as cla
 
 from ...opencl.engine import Engine
 from ...tessellation.device_diagram import Tessellation
+from ..tuning import LONGEST_DESCENT
 
 
 class SurfaceDescent:
@@ -24,15 +25,15 @@ class SurfaceDescent:
         *,
         bad_cell_weight: float = 0.0,
         rate: float = 0.1,
-        max_displacement: float = 0.2,
     ) -> None:
         """Write the displacement ``-rate h^2 dE/dx`` to `lloyd` (n, 3), in place of the displacement to the centroid.
+
+        It is at most `LONGEST_DESCENT` h.
 
         - `t`: with vertices.
         - `h`, `quality`: (n,) real
         - `bad_cell_weight`: the weight of a cell is omega = 1 - bad_cell_weight log Q.
         - `rate`: step length.
-        - `max_displacement`: largest displacement over h.
         """
         engine, k, real = self.engine, self._kernels, self.engine.real.type
         with engine.workspace.frame():
@@ -41,5 +42,5 @@ class SurfaceDescent:
             engine.run_each(k.compute_surface_forces, t.n, *cells, real(bad_cell_weight), forces)
             t.forward(engine, forces)
             faces = *t.graph, t.face_measures, t.face_centroids, t.vertices[0]
-            limits = real(rate), real(max_displacement)
+            limits = real(rate), real(LONGEST_DESCENT)
             engine.run_each(k.descend_surface, t.n, *faces, t.points, h, forces, *limits, lloyd, *engine.period_args)

@@ -93,9 +93,9 @@ class BoxTree:
         """Return each box's longest edge (m,)."""
         return reduce(np.maximum, self.edges().T)
 
-    def volumes(self, chosen: slice | np.ndarray = _ALL) -> np.ndarray:
+    def volumes(self) -> np.ndarray:
         """Return the boxes' areas or volumes (m,)."""
-        return reduce(np.multiply, self.edges(chosen).T)
+        return reduce(np.multiply, self.edges().T)
 
     def points(self, at: np.ndarray, chosen: slice | np.ndarray = _ALL) -> np.ndarray:
         """Return the points (m, p, d) at relative positions `at` (p, d) or (m, p, d) in [0, 1]."""

@@ -1,12 +1,14 @@
 """The gradients of quality and of short edges against finite differences of the energy, by diagrams from Qhull."""
 
 import itertools
+from unittest import mock
 
 import numpy as np
 import pyopencl as cl
 import pytest
 
 import clvoro
+from clvoro.adaptation.descent import quality_descent
 from clvoro.adaptation.descent.quality_descent import QualityDescent, Repulsion
 from clvoro.adaptation.stages import Stages
 from clvoro.opencl.engine import Engine
@@ -35,29 +37,20 @@ def energy(points, omega):
     return float((omega * (2 * np.log(perimeter) - np.log(area))).sum())
 
 
-def descend_from(engine, t, h, bad_cell_weight, rate, max_displacement, quality, stiffness=0.0, full_rate=1e30):
-    """Displacements from the diagram `t`."""
+def descend_from(engine, t, h, quality, rate=0.3, edges=NONE, pairs=NONE, most=1e9, full_rate=1e30, **weights):
+    """Displacements from the diagram `t`, by the given terms of the energy and limits."""
     out = engine.empty((t.n, 2))
-    QualityDescent(engine).descend(
-        t,
-        engine.upload(h),
-        engine.upload(quality),
-        out,
-        bad_cell_weight=bad_cell_weight,
-        rate=rate,
-        max_displacement=max_displacement,
-        edges=Repulsion(0.2, stiffness),
-        pairs=NONE,
-        full_rate=full_rate,
-    )
+    terms = {"SHORT_EDGES": edges, "CLOSE_PAIRS": pairs, "LONGEST_DESCENT": most, "FULL_RATE": full_rate}
+    with mock.patch.multiple(quality_descent, **terms):
+        QualityDescent(engine).descend(t, engine.upload(h), engine.upload(quality), out, rate=rate, **weights)
     return out.get()
 
 
-def descend(engine, points, h, bad_cell_weight, rate=0.1, max_displacement=0.2, quality=None, stiffness=0.0):
+def descend(engine, points, h, bad_cell_weight, quality=None, rate=0.1, most=0.2, **terms):
     """Displacements from points, with the quality of their cells by default."""
     quality = qualities(points)[:, 0] if quality is None else quality
-    t = patch.tessellate(engine, points)
-    return descend_from(engine, t, h, bad_cell_weight, rate, max_displacement, quality, stiffness)
+    t, terms = patch.tessellate(engine, points), {"rate": rate, "most": most, **terms}
+    return descend_from(engine, t, h, quality, bad_cell_weight=bad_cell_weight, **terms)
 
 
 def gradient_of(energy, points, some=None, step=1e-5):
@@ -77,7 +70,7 @@ def test_gradient(ctx, bad_cell_weight):
     """Generators, those at walls and in corners included, move by -rate h^2 dE/dx."""
     points = patch.relaxed_points(N, 2112, steps=3)
     h = np.random.default_rng(6).uniform(0.05, 0.2, N)
-    u = descend(patch.make_engine(ctx), points, h, bad_cell_weight, rate=0.3, max_displacement=1e9)
+    u = descend(patch.make_engine(ctx), points, h, bad_cell_weight, rate=0.3, most=1e9)
     omega = 1 - bad_cell_weight * np.log(qualities(points)[:, 0])
     # Every third one, from the walls to the middle.
     some = np.argsort(np.minimum(points, patch.BOX.upper - points).min(axis=1))[::3]
@@ -108,7 +101,7 @@ def test_gradient_in_a_polygon(ctx):
     placed = domain.place(points, real)
     t = Tessellator(Stages(engine), domain).tessellate(engine.upload(placed), n)
     q, h = rng.uniform(0.5, 1, n), rng.uniform(0.05, 0.2, n)
-    u = descend_from(engine, t, h, 5.0, rate=0.3, max_displacement=1e9, quality=q)
+    u = descend_from(engine, t, h, q)
     # E is the same in any unit.
     unit = np.linalg.norm(points[1] - points[0]) / np.linalg.norm(placed[1] - placed[0])
     omega = 1 - 5 * np.log(q)
@@ -139,7 +132,7 @@ def test_gradient_across_seams(ctx, periodic):
     engine = patch.make_engine(ctx, box=box)
     placed = engine.upload(box.place(points, engine.real))
     t = Tessellator(Stages(engine), box).tessellate(placed, n)
-    u = descend_from(engine, t, h, 5.0, rate=0.3, max_displacement=1e9, quality=q)
+    u = descend_from(engine, t, h, q)
     omega = 1 - 5 * np.log(q)
 
     def energy(points):
@@ -220,24 +213,13 @@ def test_gradient_of_short_edges(ctx, name):
     placed = domain.place(points, real)
     unit = domain.frame[1]
     t = Tessellator(Stages(engine), domain).tessellate(engine.upload(placed), n)
-    out = engine.empty((n, 2))
-    QualityDescent(engine).descend(
-        t,
-        engine.upload(h / unit),
-        engine.upload(np.full(n, 0.5)),
-        out,
-        quality_weight=0,
-        rate=0.3,
-        max_displacement=1e9,
-        edges=Repulsion(short, 2),
-        pairs=NONE,
-    )
+    u = descend_from(engine, t, h / unit, np.full(n, 0.5), edges=Repulsion(short, 2), quality_weight=0)
     some = rng.permutation(n)[:16]
     gradient = gradient_of(lambda x: 2 * edge_energy(adapter.diagram(domain, x), h, short), points, some)
     expected = -0.3 * h[:, None] ** 2 * gradient / unit
     scale = np.abs(expected).max()
     assert (np.abs(expected[some]) > 1e-3 * scale).all(axis=1).sum() > 8
-    assert out.get()[some] == pytest.approx(expected[some], rel=1e-4, abs=1e-5 * scale)
+    assert u[some] == pytest.approx(expected[some], rel=1e-4, abs=1e-5 * scale)
 
 
 def test_gradient_of_close_generators(ctx):
@@ -245,18 +227,8 @@ def test_gradient_of_close_generators(ctx):
     points, rng = patch.relaxed_points(N, 2118, steps=1), np.random.default_rng(8)
     h, limit = rng.uniform(0.1, 0.15, N), 0.9
     engine = patch.make_engine(ctx)
-    out = engine.empty((N, 2))
-    QualityDescent(engine).descend(
-        patch.tessellate(engine, points),
-        engine.upload(h),
-        engine.upload(np.full(N, 0.5)),
-        out,
-        quality_weight=0,
-        rate=0.3,
-        max_displacement=1e9,
-        edges=NONE,
-        pairs=Repulsion(limit, 2),
-    )
+    t, q = patch.tessellate(engine, points), np.full(N, 0.5)
+    u = descend_from(engine, t, h, q, pairs=Repulsion(limit, 2), quality_weight=0)
     expected, pairs = np.zeros((N, 2)), 0
     for i, cell in enumerate(reference.box_voronoi(patch.BOX.lower, patch.BOX.upper, points)):
         for j in cell.neighbors:
@@ -266,7 +238,7 @@ def test_gradient_of_close_generators(ctx):
                 expected[i] += 0.3 * h[i] ** 2 * 2 * (limit - away / unit) / unit * way / away
                 pairs += 1
     assert 10 < pairs < 4 * N
-    assert out.get() == pytest.approx(expected, rel=1e-9, abs=1e-15)
+    assert u == pytest.approx(expected, rel=1e-9, abs=1e-15)
 
 
 @pytest.mark.sparse(1)
@@ -281,7 +253,7 @@ def test_short_edges_grow(ctx, real):
         d = adapter.diagram(patch.BOX, points)
         return d.face_measures[d.neighbors >= 0].min()
 
-    u = descend(engine, points, np.full(4, 0.2), 0.0, quality=np.full(4, 0.9), stiffness=50)
+    u = descend(engine, points, np.full(4, 0.2), 0.0, np.full(4, 0.9), edges=Repulsion(0.2, 50))
     assert 1e-3 < length(points) < 0.05 * 0.2
     assert length(points + u) > 2 * length(points)
 
@@ -312,8 +284,8 @@ def test_longest(ctx):
     points = patch.relaxed_points(N, 2114, steps=0)
     h = np.full(N, 0.1)
     engine = patch.make_engine(ctx)
-    free = descend(engine, points, h, 5.0, max_displacement=1e9)
-    u = descend(engine, points, h, 5.0, max_displacement=0.03)
+    free = descend(engine, points, h, 5.0, most=1e9)
+    u = descend(engine, points, h, 5.0, most=0.03)
     length = np.linalg.norm(free, axis=1)
     assert 3 < (length > 0.003).sum() < N
     assert u == pytest.approx(free * np.minimum(1, 0.003 / length)[:, None], rel=1e-9, abs=1e-15)
@@ -326,7 +298,7 @@ def test_rate_falls_with_the_weight_of_bad_cells(ctx):
     q, _, area = qualities(points).T
     engine = patch.make_engine(ctx)
     t = patch.tessellate(engine, points)
-    free, u = (descend_from(engine, t, h, 20.0, 0.1, 1e9, q, full_rate=f) for f in (1e30, limit))
+    free, u = (descend_from(engine, t, h, q, full_rate=f, bad_cell_weight=20.0) for f in (1e30, limit))
     per_area = (1 - 20 * np.log(q)) / area
     cells = reference.box_voronoi(patch.BOX.lower, patch.BOX.upper, points)
     rows = [[i, *(j for j in cell.neighbors if j >= 0)] for i, cell in enumerate(cells)]

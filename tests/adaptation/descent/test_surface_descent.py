@@ -5,6 +5,7 @@ from functools import cache
 import numpy as np
 import pytest
 
+from clvoro.adaptation.descent import surface_descent
 from clvoro.adaptation.descent.surface_descent import SurfaceDescent
 from clvoro.geometry.box import Box
 from clvoro.tessellation.bins import Bins
@@ -55,7 +56,7 @@ def gradient(points, omega):
 
 @pytest.mark.sparse(1)
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
-def test_descent_follows_the_gradient(ctx, dtype):
+def test_descent_follows_the_gradient(ctx, monkeypatch, dtype):
     engine = patch.make_engine(ctx, dtype, dim=3)
     points, quality, expected = expected_descent()
     placed = engine.upload(points)
@@ -63,15 +64,9 @@ def test_descent_follows_the_gradient(ctx, dtype):
 
     def descend(most):
         out = engine.empty((N, 3)).fill(KEPT)
-        SurfaceDescent(engine).descend(
-            t,
-            engine.upload(np.full(N, H)),
-            engine.upload(quality),
-            out,
-            bad_cell_weight=WEIGHT,
-            rate=RATE,
-            max_displacement=most,
-        )
+        monkeypatch.setattr(surface_descent, "LONGEST_DESCENT", most)
+        given = engine.upload(np.full(N, H)), engine.upload(quality)
+        SurfaceDescent(engine).descend(t, *given, out, bad_cell_weight=WEIGHT, rate=RATE)
         return out.get()
 
     tolerance = 1e-6 if dtype == "float64" else 1e-3  # of the finite differences; of single precision
