@@ -17,13 +17,13 @@ import shapely
 
 from ..arguments import check_rows, warn
 from ..errors import InputError, InputTypeError, MismatchWarning
-from ..geometry.geojson import pieces_of_geojson, pieces_of_shape, read_geojson
+from ..geometry.geojson import pieces_of_geojson, pieces_of_shape
+from ..geometry.lines.lines import EXPECTED, paths_of
 from ..geometry.polygon import Polygon
 
 _Predicate = Literal["intersects", "contains"]
 _FARTHEST = 720.0  # longitude
 _NEAR_POLE = 90 - 1e-7  # latitude
-_LINES = "lines: an array (k, 2), a list of such arrays, shapely LineStrings or GeoJSON"
 
 
 @dataclass(frozen=True)
@@ -107,32 +107,14 @@ def area_of(name: str, shape: object) -> LonLatArea:
 
 
 def lines_of(name: str, lines: Any) -> list[np.ndarray]:
-    """Return lines (k, 2) with continuous longitudes; see `_LINES` for what they are given as.
+    """Return lines (k, 2) with continuous longitudes; see `paths_of` for what they are given as.
 
     Raises `InputError` or `InputTypeError` if there are no lines, a line has fewer than two positions, or a position is
     not a longitude and a latitude.
     """
-    if isinstance(lines, str | PathLike | Mapping):
-        found, where = read_geojson(lines)
-        parts = _lines_of_geojson(found, where)
-    elif isinstance(lines, shapely.Geometry):
-        parts = _lines_of_shape(name, lines)
-    elif isinstance(lines, np.ndarray) and lines.ndim == 2:
-        parts = [lines]
-    elif isinstance(lines, list | tuple | np.ndarray):
-        first = lines[0] if len(lines) else None
-        if isinstance(first, list | tuple | np.ndarray) and np.ndim(first[0]) == 0:
-            parts = [lines]  # positions of one line
-        else:
-            parts = [
-                part
-                for line in lines
-                for part in (_lines_of_shape(name, line) if isinstance(line, shapely.Geometry) else [line])
-            ]
-    else:
-        raise InputTypeError(f"{name} is a {type(lines).__name__}, expected {_LINES}")
+    parts = list(paths_of(name, lines))
     if not parts:
-        raise InputError(f"{name} has no line, expected {_LINES}")
+        raise InputError(f"{name} is empty, expected {EXPECTED}")
     checked = [check_lonlat(f"{name}[{k}]", part) for k, part in enumerate(parts)]
     for k, line in enumerate(checked):
         if len(line) < 2:
@@ -223,30 +205,3 @@ def _unwrapped(lon: np.ndarray, steps: np.ndarray) -> np.ndarray:
     """Return the longitudes of a line, which goes the short way around the globe."""
     short = np.where(np.abs(steps) <= 180, steps, steps - 360 * np.rint(steps / 360))
     return lon[0] + np.concatenate([[0.0], np.cumsum(short)])
-
-
-def _lines_of_shape(name: str, shape: shapely.Geometry) -> list[np.ndarray]:
-    kind = getattr(shape, "geom_type", type(shape).__name__)
-    if kind not in ("LineString", "MultiLineString"):
-        raise InputTypeError(f"{name} has a {kind}, expected {_LINES}")
-    return [np.asarray(part.coords)[:, :2] for part in shapely.get_parts(shape)]
-
-
-def _lines_of_geojson(node: Any, name: str) -> list[object]:
-    """Return the positions of each line in an object of GeoJSON."""
-    kind = node.get("type") if isinstance(node, Mapping) else None
-    if kind in ("FeatureCollection", "GeometryCollection"):
-        members = node.get("features" if kind == "FeatureCollection" else "geometries")
-        if isinstance(members, list | tuple):
-            return [line for member in members for line in _lines_of_geojson(member, name)]
-    if kind == "Feature":
-        return _lines_of_geojson(node.get("geometry"), name)
-    lines = node.get("coordinates") if isinstance(node, Mapping) else None
-    if kind == "LineString":
-        lines = [lines]
-    if kind not in ("LineString", "MultiLineString") or not isinstance(lines, list | tuple):
-        raise InputError(f"{name} has {node!r:.60}, expected LineString or MultiLineString only")
-    return [
-        [p[:2] if isinstance(p, list | tuple) else p for p in line] if isinstance(line, list | tuple) else line
-        for line in lines
-    ]

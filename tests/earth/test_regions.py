@@ -359,11 +359,11 @@ def test_wrong_land_is_refused(globe, land, kind, message):
     [
         ([(0, 0), (0, 95)], InputError, r"passages\[0\] has the position \(0, 95\)"),
         ([[(0, 0), (5, 5)], [(0, 0)]], InputError, r"passages\[1\] has 1 position"),
-        ([(0, np.nan), (0, 5)], InputError, "has the position"),
-        ([], InputError, "passages has no line"),
-        (3, InputTypeError, "passages is a int"),
+        ([(0, np.nan), (0, 5)], InputError, "passages has the vertex"),
+        ([], InputTypeError, r"passages has \[\], expected points"),
+        (3, InputTypeError, "passages has 3"),
         (shapely.Point(0, 0), InputTypeError, "passages has a Point"),
-        ({"type": "Polygon", "coordinates": []}, InputError, "expected LineString"),
+        ({"type": "Polygon", "coordinates": []}, InputError, "passages is empty"),
     ],
 )
 def test_wrong_lines_are_refused(globe, lines, kind, message):

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 _SNAP = 1e-7  # of the domain: an end that is so near to another line, or to a wall, lies on it
 _SMALLER = 0.8  # of the size field: sizes beside lines below this count as smaller
 _SAGITTA = 0.15  # of a chord: largest distance of its middle from the curve
-_EXPECTED = "points (k, 2), curves of clvoro.curves, lines or polygons of shapely, GeoJSON, or a list of these"
+EXPECTED = "points (k, 2), curves of clvoro.curves, lines or polygons of shapely, GeoJSON, or a list of these"
 
 
 class Network(NamedTuple):
@@ -46,9 +46,9 @@ class Lines(Borders):
     word = "lines"
 
     def __init__(self, source: object) -> None:
-        self.paths = tuple(_without_repetitions(path) for path in _paths(source))
+        self.paths = tuple(_without_repetitions(path) for path in paths_of("lines", source))
         if not self.paths:
-            raise InputError(f"lines is empty, expected {_EXPECTED}")
+            raise InputError(f"lines is empty, expected {EXPECTED}")
         for k, path in enumerate(self.paths):
             path.setflags(write=False)
             if len(path) < 2:
@@ -198,33 +198,35 @@ class Lines(Borders):
         return found
 
 
-def _paths(source: object) -> Iterator[np.ndarray]:
-    """Yield the vertices (k, 2) of all lines of `source`."""
+def paths_of(name: str, source: object) -> Iterator[np.ndarray]:
+    """Yield the vertices (k, 2) of all lines of `source`, which `name` names in errors.
+
+    Raises `InputError` or `InputTypeError` if it is something else, or a vertex is not finite.
+    """
     if isinstance(source, Lines):
         yield from source.paths
     elif isinstance(source, Curve):
         vertices = source.vertices
         yield np.concatenate([vertices, vertices[:1]]) if source.closed else vertices
     elif isinstance(source, shapely.Geometry):
-        yield from _of_shape(source)
+        yield from _of_shape(name, source)
     elif isinstance(source, Mapping | str | PathLike) or hasattr(source, "__geo_interface__"):
-        found, name = read_geojson(source)
-        yield from _of_geojson(found, name)
+        found, file = read_geojson(source)
+        yield from _of_geojson(name, found, file)
     else:
-        yield from _of_sequence(source)
+        yield from _of_sequence(name, source)
 
 
-def _of_sequence(source: Any) -> Iterator[np.ndarray]:
+def _of_sequence(name: str, source: Any) -> Iterator[np.ndarray]:
     array: np.ndarray
     try:
         array = np.asarray(source, dtype=float)
     except (TypeError, ValueError):
         array = np.empty(0)
     if array.ndim == 2 and array.shape[1] == 2:
-        if not np.isfinite(array).all():
-            raise InputError(
-                f"lines has the vertex {array[~np.isfinite(array).all(axis=1)][0]}, expected finite numbers"
-            )
+        bad = ~np.isfinite(array).all(axis=1)
+        if bad.any():
+            raise InputError(f"{name} has the vertex {array[bad][0]}, expected finite numbers")
         yield array.copy()
         return
     if (
@@ -232,36 +234,36 @@ def _of_sequence(source: Any) -> Iterator[np.ndarray]:
         or not len(source)
         or (np.ndim(source[0]) == 0 and (isinstance(source[0], int | float)))
     ):
-        raise InputTypeError(f"lines has {source!r:.60}, expected {_EXPECTED}")
+        raise InputTypeError(f"{name} has {source!r:.60}, expected {EXPECTED}")
     for item in source:
-        yield from _paths(item)
+        yield from paths_of(name, item)
 
 
-def _of_shape(shape: Any) -> Iterator[np.ndarray]:
+def _of_shape(name: str, shape: Any) -> Iterator[np.ndarray]:
     for part in shapely.get_parts(shape):
         if part.geom_type in ("Polygon", "MultiPolygon"):
             part = part.boundary
         if part.geom_type in ("MultiLineString", "GeometryCollection"):
-            yield from _of_shape(part)
+            yield from _of_shape(name, part)
         elif part.geom_type in ("LineString", "LinearRing") and not part.is_empty:
             yield shapely.get_coordinates(part)
         else:
-            raise InputTypeError(f"lines has a {part.geom_type}, expected {_EXPECTED}")
+            raise InputTypeError(f"{name} has a {part.geom_type}, expected {EXPECTED}")
 
 
-def _of_geojson(node: Any, name: str) -> Iterator[np.ndarray]:
+def _of_geojson(name: str, node: Any, file: str) -> Iterator[np.ndarray]:
     kind = node.get("type") if isinstance(node, Mapping) else None
     if kind == "FeatureCollection":
         for feature in node.get("features") or ():
-            yield from _of_geojson(feature, name)
+            yield from _of_geojson(name, feature, file)
     elif kind == "Feature":
-        yield from _of_geojson(node.get("geometry"), name)
+        yield from _of_geojson(name, node.get("geometry"), file)
     else:
         try:
             shape = shapely.geometry.shape(dict(node))
         except Exception as error:
-            raise InputError(f"{name} has {node!r:.60} ({error!s:.100}), expected GeoJSON with lines") from error
-        yield from _of_shape(shape)
+            raise InputError(f"{file} has {node!r:.60} ({error!s:.100}), expected GeoJSON with lines") from error
+        yield from _of_shape(name, shape)
 
 
 def _without_repetitions(path: np.ndarray) -> np.ndarray:
