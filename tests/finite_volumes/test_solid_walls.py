@@ -246,6 +246,18 @@ def test_an_edge_across_a_crease_with_both_ends_outside_closes_a_face(ctx, seed)
     assert abs(faces.volumes.sum() - 1) < 1e-12
 
 
+def test_faces_that_end_on_a_narrow_strip_cross_both_of_its_creases(ctx):
+    """The wall on both sides of the strip is one patch."""
+    angle = np.radians(np.linspace(50, 310, 33))
+    tip = [(0.9, -0.3 * H), (0.9, 0.3 * H)]
+    solid = clvoro.Solid.extruded(clvoro.Polygon([*np.column_stack([np.cos(angle), np.sin(angle)]) * 0.6, *tip]), 0, 1)
+    x = generators(solid)
+    h = np.full(len(x), H)
+    faces = solid_diagram(WallSurface(solid), x, h, lambda x: whole_faces(ctx, solid, x, h)).faces
+    strip = np.isclose(faces.normal[:, 0], 1, atol=1e-9) & (faces.neighbor < 0)
+    assert faces.area[strip].sum() == pytest.approx(0.6 * H, rel=1e-9)
+
+
 def test_a_cell_with_a_concave_crease_is_cut(ctx):
     """Where generators beside the crease are off their places, it passes through a cell."""
     solid = el()

@@ -8,6 +8,7 @@ import numpy as np
 
 from ...mesh.connectivity import following, rows_with, take_rows
 from ...mesh.faces import Faces
+from .mend import cells_of
 from .wall_surface import WallSurface
 
 _DEEPEST = 0.15
@@ -62,14 +63,16 @@ def balanced(surface: WallSurface, faces: Faces) -> Faces:
     return replace(faces, points=points)
 
 
-def unbalanced(faces: Faces, chords: np.ndarray, cells: np.ndarray) -> Faces:
-    """Return `faces` with the vertices of `cells` (k,) int where they were before `balanced`, at `chords` (v, 3)."""
-    corners = take_rows(
-        faces.starts, faces.corners, np.flatnonzero(np.isin(faces.owner, cells) | np.isin(faces.neighbor, cells))
-    )[1]
-    points = faces.points.copy()
-    points[corners] = chords[corners]
-    return replace(faces, points=points)
+def unbalanced(faces: Faces, chords: np.ndarray, cells: np.ndarray) -> tuple[Faces, np.ndarray]:
+    """Return `faces` with the vertices of `cells` (k,) int where they were before `balanced`, at `chords` (v, 3).
+
+    Return also which cells have such a vertex, (n,) bool.
+    """
+    back = np.zeros(len(faces.points), bool)
+    rows = np.flatnonzero(np.isin(faces.owner, cells) | np.isin(faces.neighbor, cells))
+    back[take_rows(faces.starts, faces.corners, rows)[1]] = True
+    points = np.where(back[:, None], chords, faces.points)
+    return replace(faces, points=points), cells_of(faces, rows_with(faces.starts, back[faces.corners]))
 
 
 def _depths(

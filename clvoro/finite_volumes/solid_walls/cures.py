@@ -274,21 +274,28 @@ class Cures:
 
     def _placed(self, walls: set[int], x: np.ndarray, h: float) -> np.ndarray | None:
         """Return x moved onto all of the `walls` (negative numbers), or None if they do not meet near it."""
-        patches = {-1 - n for n in walls}
-        if not patches:
-            return x
-        if len(patches) == 1:
-            triangle, foot, _ = self.surface.closest(x[None])
-            return foot[0] if int(self.surface.patch[triangle[0]]) in patches else None
-        if len(patches) == 2:
-            one, other = (np.array([p]) for p in sorted(patches))
-            edge, foot = self.surface.nearest_crease(x[None], np.array([_REACH * h]), (one, other))
-            return foot[0] if edge[0] >= 0 else None
-        far = np.linalg.norm(self.surface.corners - x, axis=1)
-        for c in np.flatnonzero(far < _REACH * h).tolist():
-            if patches <= set(self.surface.patches_of(self.surface.first_corner + c)):
-                return self.surface.corners[c]
-        return None
+        fits, places = self._all_placed([walls], x[None], h)
+        return places[0] if fits[0] else None
+
+    def _all_placed(self, walls: list[set[int]], x: np.ndarray, h: float) -> tuple[np.ndarray, np.ndarray]:
+        """Return for each of the points x (k, 3) whether its `walls` meet near it, and the place there, (k, 3)."""
+        fits, places = np.ones(len(x), bool), x.copy()
+        patches = [sorted(-1 - n for n in w) for w in walls]
+        count = np.array([len(p) for p in patches])
+        on, at = np.flatnonzero(count == 1), np.flatnonzero(count == 2)
+        if len(on):
+            triangle, places[on], _ = self.surface.closest(x[on])
+            fits[on] = self.surface.patch[triangle] == [patches[k][0] for k in on]
+        if len(at):
+            one, other = np.array([patches[k] for k in at]).T
+            edge, places[at] = self.surface.nearest_crease(x[at], np.full(len(at), _REACH * h), (one, other))
+            fits[at] = edge >= 0
+        for k in np.flatnonzero(count > 2).tolist():
+            near = np.flatnonzero(np.linalg.norm(self.surface.corners - x[k], axis=1) < _REACH * h)
+            corners = [c for c in near if {*patches[k]} <= {*self.surface.patches_of(self.surface.first_corner + c)}]
+            fits[k] = len(corners) > 0
+            places[k] = self.surface.corners[corners[0]] if corners else x[k]
+        return fits, places
 
     # Other cures.
 
@@ -361,14 +368,18 @@ class Cures:
             normal, line = normal / np.linalg.norm(normal), line / np.linalg.norm(line)
             if normal @ line > math.cos(math.radians(WANTED_ANGLE)):
                 continue
+            # One row for each share and pivot.
+            pivots = np.tile([x.mean(axis=0), *x], (len(_TURNS), 1))
+            turned = normal + np.repeat(_TURNS, len(x) + 1)[:, None] * (line - normal)
+            far = ((pivots[:, None] - x) @ turned[:, :, None])[..., 0] / (turned @ normal)[:, None]
+            moved = x + far[..., None] * normal
             walls = [edits.patches_at(cell, v) for v in loop]
-            for share, fixed in itertools.product(_TURNS, [x.mean(axis=0), *x]):
-                turned = normal + share * (line - normal)
-                moved = x + ((fixed - x) @ turned / (normal @ turned))[:, None] * normal
+            cells = [edits.faces_at(cell, v).keys() for v in loop]
+            fits, places = self._all_placed(walls * len(moved), moved.reshape(-1, 3), self.h(edits, cell))
+            for fit, place in zip(fits.reshape(len(moved), -1), places.reshape(moved.shape), strict=True):
                 trial = edits.trial()
-                for v, patches, place in zip(loop, walls, moved, strict=True):
-                    if (target := self._placed(patches, place, self.h(edits, cell))) is not None:
-                        trial.move(cell, v, target)
+                for i in np.flatnonzero(fit).tolist():
+                    trial.move(cells[i], loop[i], place[i])
                 yield trial
 
     def unions(self, edits: Edits, cell: int) -> Iterator[Edits]:
@@ -457,7 +468,7 @@ class Cures:
 def _collapse(edits: Edits, cell: int, vertices: list[int], target: np.ndarray) -> None:
     """Make one vertex, at `target`, of several; faces with fewer than three corners left vanish."""
     first, *others = vertices
-    edits.move(cell, first, target)
+    edits.move(edits.faces_at(cell, first), first, target)
     for v in others:
         for k in set().union(*edits.faces_at(cell, v).values()):
             owner, neighbor, loop = edits.face(k)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterable, Iterator
+from typing import NamedTuple
 
 import numpy as np
 
@@ -65,6 +66,13 @@ class Edits:
     def trial(self) -> Edits:
         """Return changes on top of these, none at first. They can be dropped, or become part of these; see `take`."""
         return Edits(self.mesh, self)
+
+    def shape(self) -> Edits:
+        """Return these edits without trials on top that only move vertices."""
+        at = self
+        while at.parent is not None and not at._faces:
+            at = at.parent
+        return at
 
     def take(self, trial: Edits) -> None:
         """Make the changes of a trial part of these, also of a trial of a trial."""
@@ -219,10 +227,10 @@ class Edits:
         self.next_point += 1
         return self.next_point - 1
 
-    def move(self, cell: int, vertex: int, x: np.ndarray) -> None:
-        """Move a vertex of `cell`."""
+    def move(self, cells: Iterable[int], vertex: int, x: np.ndarray) -> None:
+        """Move a vertex of these `cells`."""
         self._points[vertex] = x
-        self.touched |= self.faces_at(cell, vertex).keys()
+        self.touched.update(cells)
 
     def divide_edge(self, cell: int, a: int, b: int, x: np.ndarray) -> int:
         """Put a vertex at x on an edge of `cell`, into all faces that have the edge; return its number."""
@@ -420,57 +428,81 @@ def judge(trials: list[tuple[Edits, list[int]]], strictly: bool = False) -> list
     of a cell, above 0 if OpenFOAM rejects it, (k,) float; and the worst of its measures over their limits, (k,) float.
     With `strictly`, faces count, too, that are more oblique or skewed than wanted, far less than what is rejected.
     """
-    owner, neighbor, loops, points = [], [], [], []
-    judged: list[int] = []
-    cells = v = 0
+    regions: dict[tuple[Edits, tuple[int, ...]], _Region] = {}
+    parts, points = list[_Region](), list[np.ndarray]()
     for edits, chosen in trials:
-        number: dict[int, int] = {}
-        for c in chosen:
-            number.setdefault(c, cells + len(number))
-        judged += [number[c] for c in chosen]
-        for c in chosen:
-            for n in edits.neighbors(c):
-                if edits.is_vast(n):
-                    continue
-                number.setdefault(n, cells + len(number))
-        vertex: dict[int, int] = {}
-        for k in set().union(*(edits.faces_of(c) for c in number)):
-            i, j, loop = edits.face(k)
-            if i not in number:
-                i, j, loop = j, -1, loop[::-1]
-            elif j >= 0 and j not in number:
-                j = -1
-            owner.append(number[i])
-            neighbor.append(number[j] if j >= 0 else -1)
-            loops.append([vertex.setdefault(a, v + len(vertex)) for a in loop])
-        points.append(edits.positions(vertex))
-        cells, v = cells + len(number), v + len(vertex)
-    one, other = np.array(owner), np.array(neighbor)
+        key = edits.shape(), tuple(chosen)
+        if key not in regions:
+            regions[key] = _region(*key)
+        parts.append(regions[key])
+        points.append(edits.positions(parts[-1].vertices))
+    begun = np.cumsum([0, *(p.n_cells for p in parts)])
+    cells, faces, corners = int(begun[-1]), [len(p.owner) for p in parts], [len(p.corners) for p in parts]
+    one = np.concatenate([p.owner for p in parts]) + np.repeat(begun[:-1], faces)
+    other = np.concatenate([p.neighbor for p in parts])
+    other = np.where(other < 0, -1, other + np.repeat(begun[:-1], faces))
+    first = np.cumsum([0, *(len(x) for x in points)])[:-1]
+    loops = np.concatenate([p.corners for p in parts]) + np.repeat(first, corners)
     order = np.argsort(other < 0, kind="stable")
-    loops = [loops[k] for k in order.tolist()]
-    one, other = one[order], other[order]
-    turned = (other >= 0) & (other < one)
-    loops = [loop[::-1] if t else loop for loop, t in zip(loops, turned.tolist(), strict=True)]
-    one, other = np.where(turned, other, one), np.where(turned, one, other)
-    f = len(loops)
+    starts = np.cumsum([0, *np.concatenate([p.counts for p in parts]).tolist()])
+    starts, loops = take_rows(starts, loops, order)
     mesh = Faces(
         domain=trials[0][0].mesh.domain,
         generators=np.zeros((cells, 3)),
         points=np.concatenate(points),
-        starts=np.concatenate([[0], np.cumsum([len(loop) for loop in loops])]),
-        corners=np.array([a for loop in loops for a in loop], np.int32),
-        owner=one.astype(np.int32),
-        neighbor=other.astype(np.int32),
-        twin=np.full(f, -1),
-        shift=np.zeros((f, 3), np.int8),
-        half_face=np.full(f, -1),
+        starts=starts,
+        corners=loops.astype(np.int32),
+        owner=one[order].astype(np.int32),
+        neighbor=other[order].astype(np.int32),
+        twin=np.full(len(order), -1),
+        shift=np.zeros((len(order), 3), np.int8),
+        half_face=np.full(len(order), -1),
     )
-    rows = np.array(judged)
+    rows = np.concatenate([k + np.arange(len(chosen)) for k, (_, chosen) in zip(begun.tolist(), trials, strict=False)])
     mine = np.zeros(cells, bool)
     mine[rows] = True
     excess, worst = _measured(mesh, mine, strictly)
     ends = np.cumsum([len(chosen) for _, chosen in trials])[:-1]
     return list(zip(np.split(np.round(excess[rows], 6), ends), np.split(worst[rows], ends), strict=True))
+
+
+class _Region(NamedTuple):
+    """Some cells and, with higher numbers, their neighbors; those behind these are left out.
+
+    - `owner`, `neighbor`, `counts` (f,) int: the cells of each face and the number of its corners.
+    - `corners` (k,) int: rows of `vertices`.
+    - `vertices`: their numbers in the mesh.
+    """
+
+    owner: np.ndarray
+    neighbor: np.ndarray
+    counts: np.ndarray
+    corners: np.ndarray
+    vertices: list[int]
+    n_cells: int
+
+
+def _region(edits: Edits, cells: tuple[int, ...]) -> _Region:
+    """Return some cells with their neighbors."""
+    number = {c: k for k, c in enumerate(cells)}
+    for c in cells:
+        for n in edits.neighbors(c):
+            if not edits.is_vast(n):
+                number.setdefault(n, len(number))
+    owner, neighbor, counts, corners, vertex = list[int](), list[int](), list[int](), list[int](), dict[int, int]()
+    for k in set().union(*(edits.faces_of(c) for c in number)):
+        i, j, loop = edits.face(k)
+        if i not in number:
+            i, j, loop = j, -1, loop[::-1]
+        a, b = number[i], number.get(j, -1)
+        if 0 <= b < a:
+            a, b, loop = b, a, loop[::-1]
+        owner.append(a)
+        neighbor.append(b)
+        counts.append(len(loop))
+        corners += [vertex.setdefault(v, len(vertex)) for v in loop]
+    arrays = (np.array(x, np.int64) for x in (owner, neighbor, counts, corners))
+    return _Region(*arrays, list(vertex), len(number))
 
 
 def over_wanted(measures: SolverMeasures) -> np.ndarray:

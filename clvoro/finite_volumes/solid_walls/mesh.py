@@ -328,10 +328,11 @@ def _finished(
     chords = faces.points
     faces = balanced(surface, faces)
     tell("checks of cells at walls")
-    rejected = rejected_at_walls(faces, changed | touching_walls(faces))
+    changed |= touching_walls(faces)
+    rejected = rejected_at_walls(faces, changed)
     if len(rejected) and faces.points is not chords:
-        faces = unbalanced(faces, chords, rejected)
-        rejected = rejected_at_walls(faces, changed | touching_walls(faces))
+        faces, moved = unbalanced(faces, chords, rejected)
+        rejected = rejected_at_walls(faces, changed & with_neighbors(faces, moved))
     if len(rejected):  # where a face has been collapsed, another small one may bulge out
         suspect = np.zeros(faces.n_cells, bool)
         suspect[rejected] = True
@@ -573,7 +574,7 @@ class _Maker:
     def _bypassed(
         self, parts: TrimmedFaces, crossings: Crossings, chords: np.ndarray, taken: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return chords that miss a crossing on their face, and the crossing, (k,) each.
+        """Return chords that miss one or two crossings on their face, and each crossing, in turn, (k,) each.
 
         Both ends of such a chord lie on one patch, but between them the face ends on others.
         """
@@ -592,11 +593,13 @@ class _Maker:
         along = b - a
         share = ((x - a) * along).sum(axis=1) / np.maximum((along**2).sum(axis=1), 1e-300)
         away = np.linalg.norm(x - a - np.clip(share, 0, 1)[:, None] * along, axis=1)
-        far = away > _MISSED * self.sizes[crossings.cells[which, 0]]
-        rows = np.flatnonzero(fits & far)
-        order = rows[np.lexsort((-away[rows], chord[rows]))]
-        first = np.unique(chord[order], return_index=True)[1]
-        return chord[order[first]], which[order[first]]
+        missed = chord[fits & (away > _MISSED * self.sizes[crossings.cells[which, 0]])]
+        rows = np.flatnonzero(fits & np.isin(chord, missed))
+        rows = rows[np.lexsort((-away[rows], chord[rows]))]
+        place = np.arange(len(rows)) - np.searchsorted(chord[rows], chord[rows])
+        rows = rows[place < 2]  # a face that ends on a strip between two creases crosses both
+        rows = rows[np.lexsort((share[rows], chord[rows]))]
+        return chord[rows], which[rows]
 
     def _match_twice(
         self, crossings: Crossings, face: np.ndarray, one: np.ndarray, other: np.ndarray
@@ -653,7 +656,10 @@ class _Maker:
                 new_points.append(self.surface.corners[c])
             return corner_vertex[c]
 
-        divider = Divider(self.surface, corners_of, vertex_of)
+        def place_of(v: int) -> np.ndarray:
+            return self.points[v] if v < len(self.points) else new_points[v - len(self.points)]
+
+        divider = Divider(self.surface, corners_of, vertex_of, place_of)
         uniform = np.minimum.reduceat(label, starts[:-1]) == np.maximum.reduceat(label, starts[:-1])
         self.whole = take_rows(starts, begin, np.flatnonzero(uniform))
         self.whole_cell, self.whole_patch = cell[starts[:-1][uniform]], label[starts[:-1][uniform]]

@@ -9,6 +9,9 @@ import numpy as np
 from ...errors import ClvoroError
 from .wall_surface import WallSurface
 
+_ALONG = 0.25
+"""A chord is along a crease that is nearer to its middle than this share of its length."""
+
 
 @dataclass
 class WallPolygons:
@@ -100,16 +103,18 @@ class Divider:
 
     - `corners_of`: corners (numbers) in the interior of each cell.
     - `vertex_of_corner`: returns the vertex of a corner.
+    - `place_of`: returns the position of a vertex.
     """
 
-    def __init__(self, surface: WallSurface, corners_of: dict[int, list[int]], vertex_of_corner) -> None:
-        self.surface, self.corners_of, self.vertex_of_corner = surface, corners_of, vertex_of_corner
+    def __init__(self, surface: WallSurface, corners_of: dict[int, list[int]], vertex_of_corner, place_of) -> None:
+        self.surface, self.corners_of = surface, corners_of
+        self.vertex_of_corner, self.place_of = vertex_of_corner, place_of
         self.polygons = WallPolygons()
 
     def divide(self, cell: int, loop: list[int], labels: list[int]) -> None:
         """Divide one loop: `labels` are the patches of the sides that begin in the vertices of `loop`."""
         runs = _runs(loop, labels)
-        corners = list(self.corners_of.get(cell, ()))
+        corners = self.corners_of.get(cell, [])
         add = self.polygons.add
         while len(runs) > 2:
             done = self._cut_by_corner(cell, runs, corners) or self._cut_between(cell, runs)
@@ -122,41 +127,42 @@ class Divider:
             add(cell, runs[0][0], runs[0][1][:-1])
             return
         (p, one), (q, other) = runs
-        between = [
-            self.vertex_of_corner(c)
-            for c in corners
-            if {p, q} <= set(self.surface.patches_of(self.surface.first_corner + c))
-        ][:1]
+        found = [self.vertex_of_corner(c) for c in self._corners_between(corners, {p, q})]
+        between = [v for v in found if v not in one + other][:1]
         add(cell, p, one + between)
         add(cell, q, other + between[::-1])
 
     def _cut_by_corner(self, cell: int, runs: list[tuple[int, list[int]]], corners: list[int]) -> bool:
-        """Cut off a run whose patch meets those of both neighbors in a corner."""
-        n = len(runs)
-        for c in corners:
-            patches = set(self.surface.patches_of(self.surface.first_corner + c))
-            for k in range(n):
-                p, q, r = runs[k - 1][0], runs[k][0], runs[(k + 1) % n][0]
-                if p != r and {p, q, r} <= patches:
-                    x = self.vertex_of_corner(c)
-                    run = runs[k][1]
-                    self.polygons.add(cell, q, [*run, x])
-                    before, after = runs[k - 1], runs[(k + 1) % n]
-                    runs[k - 1] = (before[0], [*before[1], x])
-                    runs[(k + 1) % n] = (after[0], [x, *after[1]])
-                    del runs[k]
-                    if len(runs) == 2:
-                        corners.remove(c)
-                    return True
+        """Cut off a run whose patch meets those of both neighbors in a corner, a new one near its ends if there is."""
+        n, used = len(runs), {v for _, run in runs for v in run}
+        for k in range(n):
+            before, (q, run), after = runs[k - 1], runs[k], runs[(k + 1) % n]
+            if before[0] != after[0] and (fits := self._corners_between(corners, {before[0], q, after[0]})):
+                middle = (self.place_of(run[0]) + self.place_of(run[-1])) / 2
+                far = [float(np.linalg.norm(self.surface.corners[c] - middle)) for c in fits]
+                x = min((v in used, d, v) for v, d in zip(map(self.vertex_of_corner, fits), far, strict=True))[2]
+                self.polygons.add(cell, q, [*run, x])
+                runs[k - 1] = (before[0], [*before[1], x])
+                runs[(k + 1) % n] = (after[0], [x, *after[1]])
+                del runs[k]
+                return True
         return False
 
+    def _corners_between(self, corners: list[int], patches: set[int]) -> list[int]:
+        """Return those of `corners` in which all of the patches meet."""
+        return [c for c in corners if patches <= set(self.surface.patches_of(self.surface.first_corner + c))]
+
     def _cut_between(self, cell: int, runs: list[tuple[int, list[int]]]) -> bool:
-        """Cut off a run between two runs of one patch."""
+        """Cut off a run between two runs of one patch, along a crease rather than across a strip between two."""
         n = len(runs)
         found = [k for k in range(n) if runs[k - 1][0] == runs[(k + 1) % n][0]]
         if not found or n < 4:
             return False
-        k = min(found, key=lambda i: len(runs[i][1]))
+        ends = np.array([[self.place_of(runs[k][1][i]) for i in (0, -1)] for k in found])
+        patches = np.array([[runs[k][0], runs[k - 1][0]] for k in found])
+        long, middle = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1), ends.mean(axis=1)
+        across = self.surface.nearest_crease(middle, _ALONG * long, (patches[:, 0], patches[:, 1]))[0] < 0
+        k = min(zip(across.tolist(), (len(runs[k][1]) for k in found), found, strict=True))[2]
         self.polygons.add(cell, runs[k][0], runs[k][1])
         _replace(runs, k, [runs[k][1][0], runs[k][1][-1]])
         return True
