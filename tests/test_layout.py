@@ -25,6 +25,7 @@ ORDER = (
     "errors",
     "arguments",
     "files",
+    "graphs",
     "opencl",
     "geometry",
     "curves",

@@ -11,12 +11,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import scipy
 
 from ..arguments import format_point
 from ..errors import InputError
 from ..geometry.domain import Domain
 from ..geometry.sphere import Sphere, triangle_areas
+from ..graphs import components
 from ..io.contents import Contents
 from ..io.netcdf import NetCDF, squared
 from ..mesh.diagram import Diagram
@@ -281,8 +281,7 @@ def _walk_around(halves: HalfEdges) -> _Around:
     h = len(halves.cell)
     onward = halves.twin[halves.previous]
     joined = np.flatnonzero(onward >= 0)
-    graph = scipy.sparse.coo_array((np.ones(len(joined), np.int8), (joined, onward[joined])), shape=(h, h))
-    label = scipy.sparse.csgraph.connected_components(graph, directed=False)[1]
+    label = components(h, joined, onward[joined])[1]
     # Vertices are numbered by their lowest half-edge. At the boundary the first edge is the one on it.
     rank = np.lexsort((np.arange(h), halves.twin >= 0, label))
     begins = rank[np.flatnonzero(np.diff(label[rank], prepend=-1))]

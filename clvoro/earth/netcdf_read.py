@@ -14,6 +14,7 @@ import scipy
 
 from ..files import open_plain
 from ..geometry.sphere import EARTH_RADIUS, Sphere, SphereRegion, triangle_areas
+from ..graphs import components
 from ..io.arrays import FileError, explained
 from ..mesh.check.rebuilt import rebuild_on_sphere
 from ..mesh.connectivity import following
@@ -131,8 +132,7 @@ def _removed(
     other = np.where(usable[:, None], other, own)
     away = np.linalg.norm(other - own, axis=1)
     near = scipy.spatial.KDTree(other).query_pairs(_SAME * float(away[usable].min()), output_type="ndarray")
-    graph = scipy.sparse.coo_array((np.ones(len(near), np.int8), (near[:, 0], near[:, 1])), (len(own),) * 2)
-    label = scipy.sparse.csgraph.connected_components(graph, directed=False)[1]
+    label = components(len(own), *near.T)[1]
     # The longest face of each removed cell places its generator best. Walls are in the order of their first faces.
     rank = np.lexsort((-lengths, ~usable, label))
     best = rank[np.flatnonzero(np.diff(label[rank], prepend=-1))]

@@ -21,6 +21,7 @@ import scipy
 from ..arguments import check_choice, check_integer, warn
 from ..errors import InputError, InputTypeError, MismatchWarning
 from ..geometry.sphere import Sphere, SphereRegion
+from ..graphs import components
 from ..mesh.connectivity import following
 from ..mesh.diagram import Diagram
 from ..mesh.results import Result
@@ -303,9 +304,7 @@ def _large_parts(diagram: Diagram, water: np.ndarray, least_cells: int | None) -
     owner, n = diagram.half_faces.owner, len(diagram)
     joined = np.flatnonzero(diagram.neighbors >= 0)
     joined = joined[water[owner[joined]] & water[diagram.neighbors[joined]]]
-    pairs = owner[joined], diagram.neighbors[joined]
-    graph = scipy.sparse.coo_array((np.ones(len(joined), np.int8), pairs), shape=(n, n))
-    part = scipy.sparse.csgraph.connected_components(graph, directed=False)[1]
+    part = components(n, owner[joined], diagram.neighbors[joined])[1]
     if least_cells is None:
         areas = np.bincount(part, np.where(water, diagram.volumes, 0))
         return water & (part == areas.argmax())

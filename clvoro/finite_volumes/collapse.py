@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-import scipy
 
+from ..graphs import components
 from ..mesh.connectivity import distinct, following, slices, take_ranges, take_rows
 from ..mesh.diagram import Diagram
 from ..mesh.faces import Faces
@@ -237,8 +237,7 @@ class _Scan:
         i, j = self.begin[self.short], self.end[self.short]
         vertices, local = np.unique(np.concatenate([i, j]), return_inverse=True)
         i, j = local.reshape(2, -1)
-        graph = scipy.sparse.coo_array((np.ones(len(i)), (i, j)), 2 * (len(vertices),))
-        k, label = scipy.sparse.csgraph.connected_components(graph, directed=False)
+        k, label = components(len(vertices), i, j)
         h = np.full(k, np.inf)
         np.minimum.at(h, label[i], self.h[self.short])
         order = np.argsort(label, kind="stable")

@@ -9,6 +9,7 @@ from typing import Literal
 import numpy as np
 
 from ..arguments import check_choice, format_point
+from ..graphs import components
 from ..mesh.connectivity import following
 from ..mesh.diagram import Diagram
 from ..mesh.faces import Faces
@@ -258,10 +259,6 @@ def _cells_of_edges(m: SolverMeasures) -> np.ndarray:
 
 def regions(mesh: Faces) -> Criterion:
     """Return the number of connected parts of the mesh as a criterion."""
-    import scipy.sparse
-
     joined = np.flatnonzero(mesh.neighbor >= 0)
-    pair = (mesh.owner[joined], mesh.neighbor[joined])
-    graph = scipy.sparse.coo_array((np.ones(len(joined)), pair), (mesh.n_cells, mesh.n_cells))
-    found = int(scipy.sparse.csgraph.connected_components(graph, directed=False)[0])
+    found = int(components(mesh.n_cells, mesh.owner[joined], mesh.neighbor[joined])[0])
     return Criterion("regions", found, 1, True, False, found - 1)

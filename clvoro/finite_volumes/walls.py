@@ -23,6 +23,7 @@ import scipy
 
 from ..geometry.polygon import Polygon
 from ..geometry.rings import WALL_CORNER, OrientedRings
+from ..graphs import components, first_nodes
 from ..mesh.diagram import Diagram
 from ..mesh.faces import Faces
 from ..mesh.straightening import chain_areas, choose_corners, cross
@@ -296,8 +297,7 @@ class _WallMaker:
         order = np.argsort(key, kind="stable")
         one, two = of_end[order[:-1]], of_end[order[1:]]
         near = (np.diff(key[order]) == 0) & self._are_near(feet[one], feet[two], 2 * ON_WALL * self.least[at[one]])
-        graph = scipy.sparse.coo_array((np.ones(np.count_nonzero(near)), (one[near], two[near])), (len(at), len(at)))
-        _, group = scipy.sparse.csgraph.connected_components(graph, directed=False)
+        _, group = components(len(at), one[near], two[near])
         ends[on] = count + crossings + group
         feet = feet[np.unique(group, return_index=True)[1]]
         self.position = np.concatenate([np.full(count, np.nan), crossed[is_crossing], feet])
@@ -475,11 +475,7 @@ class _WallMaker:
         on_boundary[: len(self.position)] = ~np.isnan(self.position)
         least = np.where(on_boundary[ends].all(axis=1), CLOSED, NO_LENGTH) * self.size[owner]
         short = np.hypot(*(points[ends[:, 1]] - points[ends[:, 0]]).T) <= least
-        graph = scipy.sparse.coo_array(
-            (np.ones(np.count_nonzero(short)), tuple(ends[short].T)), (len(points), len(points))
-        )
-        _, group = scipy.sparse.csgraph.connected_components(graph, directed=False)
-        ends = np.unique(group, return_index=True)[1][group][ends]
+        ends = first_nodes(len(points), *ends[short].T)[ends]
         count = len(ends)
         made = Faces(
             domain=self.domain,

@@ -13,6 +13,7 @@ import scipy
 
 from ..arguments import format_point
 from ..errors import InputError, InputTypeError
+from ..graphs import components
 from .bvh import Tree
 from .columns import Columns
 from .shapes import coordinates
@@ -153,9 +154,7 @@ class Surface:
         join = max(self.join, _ROUND_OFF * float(np.ptp(unique, axis=0).max()))
         near = scipy.spatial.KDTree(unique).query_pairs(join, output_type="ndarray")
         if len(near):
-            shape = (len(unique), len(unique))
-            graph = scipy.sparse.coo_array((np.ones(len(near)), (near[:, 0], near[:, 1])), shape=shape)
-            joined = scipy.sparse.csgraph.connected_components(graph, directed=False)[1]
+            joined = components(len(unique), *near.T)[1]
             unique, places = unique[np.unique(joined, return_index=True)[1]], joined[places]
         return unique, places
 

@@ -6,12 +6,12 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import scipy
 
 from ..errors import InputError
 from ..finite_volumes.criteria import Criterion, Rows, SolverReport
 from ..finite_volumes.gate import LEAST_MEASURE, SOLVERS, around_islands, regions
 from ..finite_volumes.prisms import cell_loops
+from ..graphs import first_nodes
 from ..mesh.connectivity import take_rows
 from ..mesh.faces import Faces
 from ..mesh.geometry import smaller_size
@@ -122,10 +122,7 @@ def _without_empty_faces(mesh: Faces) -> Faces:
     if not short.any():
         return mesh
     # Several such faces may be in a row. All their ends become the first one.
-    size = len(mesh.points)
-    graph = scipy.sparse.coo_array((short[short], ends[short].T), shape=(size, size))
-    label = scipy.sparse.csgraph.connected_components(graph, directed=False)[1]
-    into = np.unique(label, return_index=True)[1][label]
+    into = first_nodes(len(mesh.points), *ends[short].T)
     return replace(mesh, corners=into[mesh.corners]).take_faces(~short).compact()
 
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ..graphs import components
 from .connectivity import following, inverse, slices, take_rows
 from .geometry import face_vectors, polygon_areas
 from .read_only import Sealed, read_only
@@ -261,16 +262,13 @@ class Faces(Sealed):
     @cached_property
     def images(self) -> np.ndarray:
         """Class of each point, (v,) int64: points that are periodic images of one another have the same number."""
-        import scipy.sparse
-
         upper = np.flatnonzero(self.twin > np.arange(len(self.twin)))
         v = len(self.points)
         _, there = take_rows(self.starts, self.corners, upper)
         counts, back = take_rows(self.starts, self.corners, self.twin[upper], np.ones(len(upper), bool))
         if self.dim == 2:
             back = back[following(counts)]
-        graph = scipy.sparse.coo_array((np.ones(len(there)), (there, back)), (v, v))
-        return scipy.sparse.csgraph.connected_components(graph, directed=False)[1].astype(np.int64)
+        return components(v, there, back)[1].astype(np.int64)
 
     def sides(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the cell and the face of each side of each face, (s,) each: those of the owners come first."""

@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import scipy
 
+from ..graphs import components
+
 if TYPE_CHECKING:
     import pyopencl.array as cla
 
@@ -35,8 +37,7 @@ class Components:
         beside = other >= t.n
         pairs = np.column_stack([np.repeat(self.of_cell, np.diff(starts))[beside], names[other[beside]]])
         pairs = np.concatenate(peers.exchange([np.unique(pairs, axis=0)] * peers.count))
-        graph = scipy.sparse.coo_array((np.ones(len(pairs), np.int8), tuple(pairs.T)), (self._count, self._count))
-        self._count, joined = scipy.sparse.csgraph.connected_components(graph, directed=False)
+        self._count, joined = components(self._count, *pairs.T)
         self.of_cell = joined[self.of_cell]
 
     def sums(self, *values: np.ndarray | cla.Array | None) -> np.ndarray:

@@ -10,6 +10,8 @@ import numpy as np
 import scipy
 import shapely
 
+from ...graphs import components
+
 if TYPE_CHECKING:
     from ..polygon import Polygon
 
@@ -137,7 +139,7 @@ class Triangles:
         edge = order[np.minimum(np.searchsorted(keys, wanted, sorter=order), len(keys) - 1)]
         is_wall = keys[edge] == wanted
         is_left = is_wall & (self.edges[edge, 0] == sides[..., 0])
-        _, component = components(~is_wall, self.neighbors)
+        _, component = joined_sets(~is_wall, self.neighbors)
         is_water = np.zeros(component.max() + 1, bool)
         is_water[component[is_left.any(axis=1)]] = True
         self.water = is_water[component]
@@ -176,12 +178,10 @@ def keys_of(pairs: np.ndarray) -> np.ndarray:
     return pairs[..., 0] << 32 | pairs[..., 1]
 
 
-def components(joined: np.ndarray, neighbors: np.ndarray) -> tuple[int, np.ndarray]:
+def joined_sets(joined: np.ndarray, neighbors: np.ndarray) -> tuple[int, np.ndarray]:
     """Return the number of sets of triangles that are joined through sides, (t, 3) bool, and the set of each."""
     t, k = np.nonzero(joined & (neighbors >= 0))
-    pairs = (t, neighbors[t, k])
-    graph = scipy.sparse.coo_array((np.ones(len(t), bool), pairs), (len(joined), len(joined)))
-    return scipy.sparse.csgraph.connected_components(graph, directed=False)
+    return components(len(joined), t, neighbors[t, k])
 
 
 LEAST_PART = 0.12
@@ -215,7 +215,7 @@ class Parts:
         inner = chosen[:, None] & (near >= 0) & chosen[near]
         water = triangles.water[:, None]
         same = np.where(near < 0, ~water, triangles.water[near] == water)
-        component = components(inner, near)[1][self.row]
+        component = joined_sets(inner, near)[1][self.row]
         names, self.part = np.unique(component, return_inverse=True)
         self.count, self.rim = len(names), (~inner & same)[self.row]
         self.area = self.sums(triangles.area[self.row])
@@ -293,8 +293,7 @@ def small_land(triangles: Triangles, scale: float) -> np.ndarray:
     ends = [keys_of(np.column_stack([part, corners[np.arange(len(t)), (k + i) % 3]])) for i in (1, 2)]
     nodes, index = np.unique(ends, return_inverse=True)
     begin, end = index.reshape(2, -1)
-    graph = scipy.sparse.coo_array((np.ones(len(t)), (begin, end)), (len(nodes), len(nodes)))
-    count, root = scipy.sparse.csgraph.connected_components(graph, directed=False)
+    count, root = components(len(nodes), begin, end)
     part_of_root = np.zeros(count, np.int64)
     part_of_root[root] = nodes >> 32
     capes = ~small & (np.bincount(part_of_root, minlength=parts.count) == 1)

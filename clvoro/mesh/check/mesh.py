@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import scipy
 
+from ...graphs import components
 from ..connectivity import take_rows
 from ..geometry import sum_rows
 from ..lookup import lifted, power_tree
@@ -87,16 +88,10 @@ def _euler_characteristic(d: Diagram) -> int | None:
     if len(np.unique(ends[:, 0])) < len(ends):
         return None
     empty = int(np.count_nonzero(np.diff(d.neighbor_starts) == 0))
-    parts = _count_components(len(d), owner[~walls], d.neighbors[~walls]) - empty
+    parts = components(len(d), owner[~walls], d.neighbors[~walls])[0] - empty
     # All other vertices are parts of their own.
     others = len(d.vertices) - len(np.unique(ends))
-    return 2 * parts - (_count_components(len(d.vertices), *ends.T) - others)
-
-
-def _count_components(n: int, i: np.ndarray, j: np.ndarray) -> int:
-    """Return the number of connected components of a graph with n nodes and the edges i to j."""
-    graph = scipy.sparse.coo_array((np.ones(len(i), np.int8), (i, j)), shape=(n, n))
-    return int(scipy.sparse.csgraph.connected_components(graph, directed=False)[0])
+    return 2 * parts - (components(len(d.vertices), *ends.T)[0] - others)
 
 
 def check_measures(check: Check, g: Rebuilt, positions: Doubts) -> None:

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, cast
 
 import numpy as np
 import pyopencl.array as cla
-import scipy
 
 from ...errors import InputError
 from ...finite_volumes.borders import on_surfaces
 from ...geometry.domain import ClipBox, Domain
+from ...graphs import first_nodes
 from ...mesh.connectivity import used_indices
 from ...mesh.diagram import Diagram
 from ...opencl.engine import Engine
@@ -182,10 +182,7 @@ def merge_ends(corners: np.ndarray, starts: np.ndarray, dropped: np.ndarray) -> 
     ends = np.arange(1, starts[-1] + 1)
     filled = np.diff(starts) > 0  # cells of power diagrams may be empty
     ends[starts[1:][filled] - 1] = starts[:-1][filled]
-    pairs = corners[dropped], corners[ends[dropped]]
-    graph = scipy.sparse.coo_array((np.ones(len(dropped), np.int8), pairs), (count, count))
-    parts = scipy.sparse.csgraph.connected_components(graph, directed=False)[1]
-    return np.unique(parts, return_index=True)[1][parts][corners]
+    return first_nodes(count, corners[dropped], corners[ends[dropped]])[corners]
 
 
 class _DiagramReader:
