@@ -1,15 +1,19 @@
-"""Open files that a caller names. Only regular files are opened: pipes may block, and devices may be endless."""
+"""Open files that a caller names: only regular ones. Pipes may block, devices may be endless. Arrays as text."""
 
 from __future__ import annotations
 
+import base64
 import errno
 import logging
 import os
 import stat
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from io import BufferedReader
 from os import PathLike
+
+import numpy as np
 
 LONGEST_GEOMETRY = 1 << 28
 """Largest size of a polygon's file in bytes: enough for the coasts of the Earth at a resolution of 100 meters."""
@@ -70,3 +74,13 @@ def _check_plain(path: str | PathLike[str], found: os.stat_result) -> None:
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), os.fsdecode(path))
     if not stat.S_ISREG(found.st_mode):
         raise OSError(errno.EINVAL, "it is a pipe, socket or device, not a regular file", os.fsdecode(path))
+
+
+def pack_array(array: np.ndarray, dtype: str) -> str:
+    """Return an array as compressed text."""
+    return base64.b64encode(zlib.compress(np.ascontiguousarray(array, dtype).tobytes(), 6)).decode("ascii")
+
+
+def unpack_array(text: str, dtype: str) -> np.ndarray:
+    """Return the array (n,) of a text of `pack_array`."""
+    return np.frombuffer(zlib.decompress(base64.b64decode(text)), dtype).copy()

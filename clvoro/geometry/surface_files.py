@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import gzip
+import math
 import os
 import re
 from collections.abc import Iterable, Sequence
+from numbers import Real
 from os import PathLike
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -23,6 +25,7 @@ _OPTIONS: dict[str, dict[str, Any]] = {
     "obj": {"skip_materials": True, "split_groups": True, "split_objects": True, "group_material": False}
 }
 _TURNS = 32  # triangles around a circle of a STEP file
+_UNITS = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "km": 1e3, "um": 1e-6, "in": 0.0254, "ft": 0.3048}
 _UNNAMED = "Open CASCADE STEP translator"  # so begin the names that Open CASCADE gives shapes without one
 
 
@@ -119,6 +122,32 @@ def joined(parts: list[FilePart]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         np.concatenate([part.triangles + start for part, start in zip(parts, starts[:-1], strict=True)]),
         np.repeat(np.arange(len(parts)), [len(part.triangles) for part in parts]),
     )
+
+
+def unit_length(units: str | float | None) -> float:
+    """Return the length of a unit in meters."""
+    if units is None:
+        return 1.0
+    if isinstance(units, str):
+        length = _UNITS.get(units, 0.0)
+    else:
+        length = float(units) if isinstance(units, Real) and not isinstance(units, bool) else 0.0
+    if 0 < length < math.inf:
+        return length
+    raise InputError(f"units is {units!r}, expected one of {', '.join(_UNITS)}, or the length of the unit in meters")
+
+
+def solid_arguments(parts: list[FilePart], unit: float) -> dict[str, Any]:
+    """Return the arguments of a solid from the parts of a file; parts of one name are one group."""
+    vertices, triangles, part = joined(parts)
+    arguments: dict[str, Any] = {"vertices": unit * vertices, "triangles": triangles}
+    if len(parts) == 1:
+        known = parts[0].name.strip()
+        return arguments | ({"group_names": [word(known, 0)]} if known else {})
+    words = [word(p.name, k) for k, p in enumerate(parts)]
+    names = list(dict.fromkeys(words))
+    groups = np.array([names.index(w) for w in words])[part]
+    return arguments | {"groups": groups, "group_names": names}
 
 
 def word(name: str, number: int) -> str:

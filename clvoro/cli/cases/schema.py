@@ -27,9 +27,9 @@ from ...geometry.curves import Curve
 from ...geometry.domain import Domain
 from ...geometry.geojson import FOREIGN, pieces_of_geojson
 from ...geometry.polygon import Polygon
-from ...geometry.solid.solid import Solid, unit_length
+from ...geometry.solid.solid import Solid
 from ...geometry.sphere import Sphere
-from ...geometry.surface_files import SOLIDS, FilePart, joined, read_parts
+from ...geometry.surface_files import SOLIDS, FilePart, joined, read_parts, unit_length
 from ...io.arrays import read_array
 from ...io.foam import PatchType
 from . import checks

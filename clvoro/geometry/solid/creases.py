@@ -12,6 +12,7 @@ import scipy
 SMOOTH, CONVEX, CONCAVE = 0, 1, 2
 """Kinds of the sides and corners of triangles; a patch goes on across smooth and convex ones."""
 _STRAIGHT = math.radians(1)  # a crease whose angle is at most this much less than 180 degrees counts as concave
+_SOFT = math.radians(60)  # borders of groups at which a wrap turns by less take the mean angle of all between the two
 _TURN = math.radians(50)  # a chain that turns by more than this at a vertex has a corner there
 
 
@@ -139,6 +140,19 @@ def dihedral_turns(vertices: np.ndarray, triangles: np.ndarray, twin: np.ndarray
     sine = np.einsum("ij,ij->i", np.cross(n, m), along)
     turn = np.arctan2(sine, np.einsum("ij,ij->i", n, m))
     return np.where(twin >= 0, turn, 0.0)
+
+
+def even_turns(turns: np.ndarray, twin: np.ndarray, group: np.ndarray, border: np.ndarray) -> None:
+    """Give all sides between two groups of a rough surface the mean of their angles, if they turn little.
+
+    - `turns`, `twin` (3 t,): angles, which change, and sides of the neighbors
+    - `group` (t,) int
+    - `border` (3 t,) bool: sides between groups
+    """
+    soft = np.flatnonzero(border & (np.abs(turns) < _SOFT))
+    pair = np.sort(group[np.stack([soft, twin[soft]]) // 3], axis=0)
+    place = np.unique(pair, axis=1, return_inverse=True)[1].reshape(-1)
+    turns[soft] = (np.bincount(place, turns[soft]) / np.bincount(place))[place]
 
 
 def connect(n: int, pairs: np.ndarray) -> tuple[int, np.ndarray]:

@@ -2,118 +2,51 @@
 
 from __future__ import annotations
 
-import base64
 import hashlib
 import math
-import zlib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from functools import cached_property
 from numbers import Real
 from os import PathLike
 from typing import Any
 
 import numpy as np
-import scipy
 
 from ...arguments import check_rows, format_point, warn
 from ...errors import InputError, MismatchWarning
+from ...files import pack_array, unpack_array
 from ..boundary_names import BoundaryNames, Walls
 from ..box import Box
-from ..bvh import Tree
 from ..columns import Columns
 from ..domain import Domain
+from ..nearest_triangles import Feet, NearestTriangles
 from ..polygon import Polygon
 from ..shapes import Edges
 from ..surface import Surface
-from ..surface_files import SOLIDS, FilePart, FilePath, joined, parts_of, read_parts, word
-from ..triangles import areas_of, packed_weights, pierced
+from ..surface_files import SOLIDS, FilePath, parts_of, read_parts, solid_arguments, unit_length
+from ..triangles import areas_of, pierced
 from ..wall_triangles import WallTriangles
+from . import primitives
 from .checks import repaired, require_bounding, sharp_edges, volume_inside
 from .combining import around, boolean, named_triangles
-from .creases import CONCAVE, CONVEX, connect, corner_normals, dihedral_turns, find_creases, triangle_normals
+from .creases import (
+    CONCAVE,
+    CONVEX,
+    connect,
+    corner_normals,
+    dihedral_turns,
+    even_turns,
+    find_creases,
+    triangle_normals,
+)
 from .stations import Stations, place_stations
-from .wrapping import wrapped
+from .wrapping import kept_groups, wrapped
 
 _ON = 1e-12  # of the diagonal: points this close to the surface lie on it
 _PROBES = 4096  # places on the surface from which widths are measured
 _FACING = -0.7  # product of the normals of two walls that face each other
-_SAMPLES = 2048  # places on the surface from which the search for nearest points begins, besides vertices
-_MOST_STEPS = 64  # along a side of a triangle
 _WRAPPED = 150.0  # degrees: a wrap has no creases
-_SOFT = math.radians(60)  # borders of groups at which a wrap turns by less take the mean angle of all between the two
 _MARGIN = 0.05  # of the longest edge, by which the clip box is larger than the region
-
-
-@dataclass(frozen=True)
-class Feet:
-    """The nearest points of a surface."""
-
-    triangle: np.ndarray
-    """(n,) int. -1 where nothing is near."""
-    weights: np.ndarray
-    """(n, 3) float. Weights of the triangle's corners in the foot; 0 to round-off for the corner opposite to a side
-    that it lies on."""
-    point: np.ndarray
-    """(n, 3) float."""
-    distance: np.ndarray
-    """(n,) float. inf where nothing is near."""
-
-
-class NearestTriangles:
-    """Some triangles of a surface, to find the nearest points on them.
-
-    - `items` (m,) int: the triangles.
-    """
-
-    def __init__(self, surface: Surface, items: np.ndarray):
-        self.items = items
-        self.corners, self._rows = surface.corners[items], surface.rows[items]
-        self._tree = Tree(self.corners.min(axis=1), self.corners.max(axis=1))
-        points, self._sampled = _samples(surface.triangles[items], self.corners)
-        self._samples = scipy.spatial.KDTree(points)
-        self._tie = _ON * float(np.ptp(surface.vertices, axis=0).max())
-
-    def feet(self, x: np.ndarray, reach: float) -> Feet:
-        """Return the nearest point of the triangles to each of the points x (n, 3), within `reach`."""
-        bound2 = np.full(len(x), reach * reach)
-        close = np.flatnonzero(np.isfinite(x).all(axis=1))
-        if reach > self._tie:
-            away, sample = self._samples.query(x[close], distance_upper_bound=reach)
-            close, sample = close[np.isfinite(away)], sample[np.isfinite(away)]
-            there2 = packed_weights(x[close], self._rows[self._sampled[sample]])[2]
-            bound2[close] = np.minimum(bound2[close], (np.sqrt(there2) + self._tie) ** 2)
-        _, item = self._tree.nearest(x, bound2, lambda y, k: packed_weights(y, self._rows[k])[2])
-        return self.feet_on(x, item)
-
-    def feet_on(self, x: np.ndarray, item: np.ndarray) -> Feet:
-        """Return the points of triangles `item` (n,) nearest to the points x (n, 3); nothing for the item -1."""
-        found = item >= 0
-        weights, away2 = np.zeros((len(x), 3)), np.full(len(x), math.inf)
-        s, t, away2[found] = packed_weights(x[found], self._rows[item[found]])
-        weights[found] = np.column_stack([1 - s - t, s, t])
-        point = np.einsum("nk,nkd->nd", weights, self.corners[item])
-        return Feet(np.where(found, self.items[item], -1), weights, point, np.sqrt(away2))
-
-
-def _samples(triangles: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return points (k, 3) on a surface, and their triangles (k,): the vertices, and a grid in each large triangle.
-
-    - `triangles`: (t, 3) int
-    - `corners`: (t, 3, 3) float
-    """
-    _, first = np.unique(triangles, return_index=True)
-    points, item = [corners.reshape(-1, 3)[first]], [first // 3]
-    longest = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2).max(axis=1)
-    spacing = math.sqrt(float(areas_of(corners).sum()) / _SAMPLES)
-    steps = np.minimum(np.ceil(longest / spacing), _MOST_STEPS).astype(int) if spacing > 0 else np.ones(len(corners))
-    for k in np.unique(steps[steps > 1]).tolist():
-        rows = np.flatnonzero(steps == k)
-        i, j = np.nonzero(np.add.outer(np.arange(k + 1), np.arange(k + 1)) <= k)
-        weights = np.column_stack([k - i - j, i, j]) / k
-        points.append(np.einsum("sk,tkd->tsd", weights, corners[rows]).reshape(-1, 3))
-        item.append(np.repeat(rows, len(weights)))
-    return np.concatenate(points), np.concatenate(item)
 
 
 class Solid(Domain):
@@ -218,19 +151,11 @@ class Solid(Domain):
         if wrap is not None:
             if creases is not None:
                 raise InputError(f"{name} has creases and wrap, expected one of them: a wrap has other vertices")
-            kept = _kept_groups(name, names, self._group_names)
-            place = np.zeros(len(self._group_names), np.int64)
-            place[[self._group_names.index(k) for k in kept]] = 1 + np.arange(len(kept))
-            given, group, done = wrapped(given, wrap, inside, place[group])
+            rest = known[0] if len(known) == 1 else "wall"
+            given, group, self._group_names, done = wrapped(
+                given, wrap, inside, group, self._group_names, kept_groups(name, names, self._group_names), rest
+            )
             self.repairs = (*self.repairs, done)
-            rest = known[0] if len(known) == 1 else "rest" if "wall" in kept else "wall"
-            self._group_names = (rest, *kept)
-            lost = [k for k in kept if k not in (self._group_names[g] for g in np.unique(group))]
-            if lost:
-                raise InputError(
-                    f"{name} has no place for {lost[0]!r} on its wrap, which is nearer to other groups, or larger; "
-                    "leave out that group or its file, or use a smaller wrap"
-                )
             angle = _WRAPPED if angle is None else angle
         places, merged = given.welded
         self._places = given.places
@@ -248,11 +173,7 @@ class Solid(Domain):
         across = self._group[self.twin // 3] != np.repeat(self._group, 3)
         border = (np.abs(turns) > math.radians(self.angle)) | across | self._drawn(creases)
         if self.angle >= 90:  # a wrap is rough, and borders of its groups are convex or concave as a whole
-            soft = np.flatnonzero(across & (np.abs(turns) < _SOFT))
-            pair = np.sort(self._group[np.stack([soft, self.twin[soft]]) // 3], axis=0)
-            _, place = np.unique(pair, axis=1, return_inverse=True)
-            place = place.reshape(-1)
-            turns[soft] = (np.bincount(place, turns[soft]) / np.bincount(place))[place]
+            even_turns(turns, self.twin, self._group, across)
         self.patch, self.creases, self.corners = find_creases(vertices, triangles, self.twin, turns, border)
         self.n_patches = int(self.patch.max()) + 1
         lower, upper = vertices[triangles].min(axis=(0, 1)), vertices[triangles].max(axis=(0, 1))
@@ -320,19 +241,19 @@ class Solid(Domain):
             If the file needs a library that is not installed.
         """
         unit = unit_length(units)
-        arguments = _from_parts(read_parts(path, SOLIDS), unit)
+        arguments = solid_arguments(read_parts(path, SOLIDS), unit)
         first, *others = [path] if isinstance(path, str | PathLike) else path
         name = f"solid {str(first)!r}" + (f" with {len(others)} more files" if others else "")
         if others and options.get("wrap") is not None:
             names = options.get("names") or {}
-            left = set(arguments["group_names"]) - set(_kept_groups(name, names, tuple(arguments["group_names"])))
+            left = set(arguments["group_names"]) - set(kept_groups(name, names, tuple(arguments["group_names"])))
             options["names"] = {**{group: group for group in arguments["group_names"] if group in left}, **names}
         return cls(**{**arguments, "name": name, **options})
 
     @classmethod
     def from_trimesh(cls, mesh: Any, **options: Any) -> Solid:
         """Return the solid inside of a ``trimesh.Trimesh``, or of all meshes of a ``trimesh.Scene`` and their names."""
-        return cls(**{**_from_parts(parts_of(mesh), 1.0), **options})
+        return cls(**{**solid_arguments(parts_of(mesh), 1.0), **options})
 
     @classmethod
     def outside(cls, of: Solid, box: Box | tuple[Sequence[float], Sequence[float]], **options: Any) -> Solid:
@@ -381,29 +302,29 @@ class Solid(Domain):
         return Solid(**boolean(operation, named_triangles(self), named_triangles(other)), angle=self.angle)
 
     @classmethod
+    def _simple(cls, made: dict[str, Any], options: dict[str, Any]) -> Solid:
+        """Return a simple solid from its arguments and the caller's `options`; a single name is for all its sides."""
+        single = len(options.get("group_names") or ()) == 1
+        return cls(**{**made, **({"groups": None} if single else {}), **options})
+
+    @classmethod
     def box(cls, lower: Sequence[float], upper: Sequence[float], **options: Any) -> Solid:
         """Return a box; its sides have the names xMin, xMax, yMin, ..."""
-        from .primitives import box
-
-        return cls(**_with_options(box(lower, upper), options))
+        return cls._simple(primitives.box(lower, upper), options)
 
     @classmethod
     def cone(
         cls, begin: Sequence[float], end: Sequence[float], radius: float, edge: float | None = None, **options: Any
     ) -> Solid:
         """Return a cone from its base around `begin` to its tip `end`, with the boundaries bottom and side."""
-        from .primitives import cone
-
-        return cls(**_with_options(cone(begin, end, radius, edge), options))
+        return cls._simple(primitives.cone(begin, end, radius, edge), options)
 
     @classmethod
     def torus(
         cls, center: Sequence[float], radius: float, tube: float, edge: float | None = None, **options: Any
     ) -> Solid:
         """Return a torus around an axis in z: a tube of the radius `tube` around a circle of `radius`."""
-        from .primitives import torus
-
-        return cls(**_with_options(torus(center, radius, tube, edge), options))
+        return cls._simple(primitives.torus(center, radius, tube, edge), options)
 
     @classmethod
     def turned(cls, profile: Sequence[Sequence[float]], edge: float | None = None, **options: Any) -> Solid:
@@ -411,16 +332,12 @@ class Solid(Domain):
 
         The boundaries are edge-0, edge-1, ..., one for each edge of the profile that is not on the axis.
         """
-        from .primitives import turned
-
-        return cls(**_with_options(turned(profile, edge), options))
+        return cls._simple(primitives.turned(profile, edge), options)
 
     @classmethod
     def extruded(cls, polygon: Polygon, bottom: float, top: float, **options: Any) -> Solid:
         """Return a `Polygon`, with its holes, between two heights; its boundaries, and those named bottom and top."""
-        from .primitives import extruded
-
-        return cls(**_with_options(extruded(polygon, bottom, top), options))
+        return cls._simple(primitives.extruded(polygon, bottom, top), options)
 
     @classmethod
     def polyhedron(cls, normals: object, offsets: object, **options: Any) -> Solid:
@@ -428,25 +345,19 @@ class Solid(Domain):
 
         The boundaries are plane-0, plane-1, ...
         """
-        from .primitives import polyhedron
-
-        return cls(**_with_options(polyhedron(normals, offsets), options))
+        return cls._simple(primitives.polyhedron(normals, offsets), options)
 
     @classmethod
     def ball(cls, center: Sequence[float], radius: float, edge: float | None = None, **options: Any) -> Solid:
         """Return a ball. `edge` is the length of the triangles' edges; by default a sixteenth of the radius."""
-        from .primitives import ball
-
-        return cls(**_with_options(ball(center, radius, edge), options))
+        return cls._simple(primitives.ball(center, radius, edge), options)
 
     @classmethod
     def cylinder(
         cls, begin: Sequence[float], end: Sequence[float], radius: float, edge: float | None = None, **options: Any
     ) -> Solid:
         """Return a cylinder around the axis from `begin` to `end`, with the boundaries side, bottom and top."""
-        from .primitives import cylinder
-
-        return cls(**_with_options(cylinder(begin, end, radius, edge), options))
+        return cls._simple(primitives.cylinder(begin, end, radius, edge), options)
 
     @property
     def meeting_walls(self) -> np.ndarray:
@@ -867,55 +778,6 @@ def _described(values: dict[str, Any]) -> Solid:
     return Solid.described(**values)
 
 
-_UNITS = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "km": 1e3, "um": 1e-6, "in": 0.0254, "ft": 0.3048}
-
-
-def unit_length(units: str | float | None) -> float:
-    """Return the length of a unit in meters."""
-    if units is None:
-        return 1.0
-    if isinstance(units, str):
-        length = _UNITS.get(units, 0.0)
-    else:
-        length = float(units) if isinstance(units, Real) and not isinstance(units, bool) else 0.0
-    if 0 < length < math.inf:
-        return length
-    raise InputError(f"units is {units!r}, expected one of {', '.join(_UNITS)}, or the length of the unit in meters")
-
-
-def _from_parts(parts: list[FilePart], unit: float) -> dict[str, Any]:
-    """Return the arguments of a solid from the parts of a file; parts of one name are one group."""
-    vertices, triangles, part = joined(parts)
-    arguments: dict[str, Any] = {"vertices": unit * vertices, "triangles": triangles}
-    if len(parts) == 1:
-        known = parts[0].name.strip()
-        return arguments | ({"group_names": [word(known, 0)]} if known else {})
-    words = [word(p.name, k) for k, p in enumerate(parts)]
-    names = list(dict.fromkeys(words))
-    groups = np.array([names.index(w) for w in words])[part]
-    return arguments | {"groups": groups, "group_names": names}
-
-
-def _with_options(made: dict[str, Any], options: dict[str, Any]) -> dict[str, Any]:
-    """Return the arguments `made` for a ball, a box, ... with the caller's `options`; one name is for all its sides."""
-    single = len(options.get("group_names") or ()) == 1
-    return {**made, **({"groups": None} if single else {}), **options}
-
-
-def _kept_groups(name: str, names: object, groups: tuple[str, ...]) -> list[str]:
-    """Return the groups that the names of boundaries mention."""
-    parts = names.values() if isinstance(names, Mapping) else ()
-    walls = [wall for part in parts for wall in (part if isinstance(part, list | tuple) else [part])]
-    kept = list(dict.fromkeys(wall for wall in walls if isinstance(wall, str)))
-    unknown = [wall for wall in kept if wall not in (*groups, "wall")]
-    if unknown:
-        raise InputError(
-            f"{name} names has {unknown[0]!r}, expected a group, {', '.join(groups)}, or wall, which a wrap has "
-            "for all groups that names does not mention"
-        )
-    return [wall for wall in kept if wall in groups and len(groups) > 1]
-
-
 def _checked_groups(name: str, groups: object, count: int) -> np.ndarray:
     """Return the group of each triangle, (t,) int64; 0 by default."""
     if groups is None:
@@ -927,13 +789,3 @@ def _checked_groups(name: str, groups: object, count: int) -> np.ndarray:
             f"of the {count} triangles"
         )
     return array.astype(np.int64)
-
-
-def pack_array(array: np.ndarray, dtype: str) -> str:
-    """Return an array as compressed text."""
-    return base64.b64encode(zlib.compress(np.ascontiguousarray(array, dtype).tobytes(), 6)).decode("ascii")
-
-
-def unpack_array(text: str, dtype: str) -> np.ndarray:
-    """Return the array (n,) of a text of `pack_array`."""
-    return np.frombuffer(zlib.decompress(base64.b64decode(text)), dtype).copy()

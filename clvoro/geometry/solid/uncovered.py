@@ -8,8 +8,8 @@ import numpy as np
 import scipy
 
 from ..columns import Columns
+from ..nearest_triangles import NearestTriangles
 from ..surface import Surface
-from .solid import NearestTriangles
 
 if TYPE_CHECKING:
     from .solid import Solid

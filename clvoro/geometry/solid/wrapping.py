@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from array import array
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from numbers import Real
 
@@ -20,6 +20,7 @@ import scipy
 
 from ...arguments import format_point
 from ...errors import InputError
+from ..nearest_triangles import NearestTriangles
 from ..surface import Surface
 from ..triangles import areas_of, packed_weights
 from .combining import boolean, library
@@ -51,76 +52,83 @@ _BISECTIONS = 10
 """How often the width of a leak is halved."""
 
 
+def kept_groups(name: str, names: object, groups: tuple[str, ...]) -> list[str]:
+    """Return the groups that the names of boundaries mention."""
+    parts = names.values() if isinstance(names, Mapping) else ()
+    walls = [wall for part in parts for wall in (part if isinstance(part, list | tuple) else [part])]
+    kept = list(dict.fromkeys(wall for wall in walls if isinstance(wall, str)))
+    unknown = [wall for wall in kept if wall not in (*groups, "wall")]
+    if unknown:
+        raise InputError(
+            f"{name} names has {unknown[0]!r}, expected a group, {', '.join(groups)}, or wall, which a wrap has "
+            "for all groups that names does not mention"
+        )
+    return [wall for wall in kept if wall in groups and len(groups) > 1]
+
+
 def wrapped(
-    surface: Surface, reach: float, inside: Sequence[float] | None, groups: np.ndarray
-) -> tuple[Surface, np.ndarray, str]:
-    """Return a closed surface around all triangles, its groups, and what was done.
+    surface: Surface,
+    reach: float,
+    inside: Sequence[float] | None,
+    groups: np.ndarray,
+    names: tuple[str, ...],
+    kept: list[str],
+    rest: str,
+) -> tuple[Surface, np.ndarray, tuple[str, ...], str]:
+    """Return a closed surface around all triangles, its groups and their names, and what was done.
 
-    Parameters
-    ----------
-    surface : Surface
-    reach : float
-    inside : three numbers, optional
-        A point: return the surface of the space around it in place of that around all triangles.
-    groups : (t,) int
-        Each place of the wrap has the group of the nearest triangle.
+    - `inside`: a point: the surface is that of the space around it
+    - `groups` (t,) int, `names`: groups of the triangles. Each place of the wrap has that of the nearest triangle.
+    - `kept`: the groups that stay; others become one with the name `rest`.
 
-    Raises
-    ------
-    InputError
-        If `reach` is no length, longer than the surface, or so small that the grid would have too many points, or
-        `inside` is no point in a space that triangles close off up to gaps 2 `reach` wide.
-    MissingLibraryError
-        If manifold3d is not installed.
+    Raises `InputError` if `reach` is no length, longer than the surface, or so small that the grid would have too many
+    points; if `inside` is no point in a space that triangles close off up to gaps 2 `reach` wide; or if a group has no
+    place. Raises `MissingLibraryError` if manifold3d is not installed.
     """
+    name = surface.name
+    middle = (surface.vertices.min(axis=0) + surface.vertices.max(axis=0)) / 2
+    near = Surface(surface.vertices - middle, surface.triangles, name)  # round-off as at the origin
+    grid = _grid_around(near, reach)
+    reach, step, samples = float(reach), grid.step, _Samples(near, grid.step)
+    away = grid.distance(samples, 2 * reach)
+    space = grid.space(away, reach, inside, middle, near)
+    sign = -1 if inside is None else 1
+    first = grid.level(name, sign * np.where(space, away - reach, -np.abs(away - reach)), _SIMPLER)
+    depth = np.where(space, 0, grid.distance(_Samples(first, step), 1.5 * reach, ~space))
+    place = np.zeros(len(names), np.int64)
+    place[[names.index(k) for k in kept]] = 1 + np.arange(len(kept))
+    made, group = _with_groups(grid.level(name, sign * ((1 - _OFF) * reach - depth)), near, place[groups], reach)
+    names = ("rest" if rest in kept else rest, *kept)
+    result = boolean("+", (made.vertices, made.triangles, group, list(names)), simpler=_SIMPLER * step)
+    lost = [names[g] for g in range(1, len(names)) if not (result["groups"] == g).any()]
+    if lost:
+        raise InputError(
+            f"{name} has no place for {lost[0]!r} on its wrap, which is nearer to other groups, or larger; "
+            "leave out that group or its file, or use a smaller wrap"
+        )
+    off = samples.distance(result["vertices"]).max()
+    made = Surface(result["vertices"] + middle, result["triangles"], name)
+    return made, result["groups"], names, f"wrapped, at most {off:.3g} away from what was given"
+
+
+def _grid_around(surface: Surface, reach: float) -> _Sampled:
+    """Return a grid that reaches beyond the wrap of a surface, or raise `InputError` if `reach` does not fit to it."""
     if isinstance(reach, bool) or not (isinstance(reach, Real) and 0 < reach < math.inf):
         raise InputError(f"{surface.name} wrap is {reach!r}, expected a length")
-    middle = (surface.vertices.min(axis=0) + surface.vertices.max(axis=0)) / 2
-    near = Surface(surface.vertices - middle, surface.triangles, surface.name)  # round-off as at the origin
-    reach, longest = float(reach), float(np.ptp(near.vertices, axis=0).max())
-    if reach > longest:
+    if reach > (longest := float(np.ptp(surface.vertices, axis=0).max())):
         raise InputError(
             f"{surface.name} wrap is {reach:g}, longer than the surface, {longest:g}; give it in the unit of the "
             "solid, which is meters with `units`"
         )
-    step = reach / _STEP
-    low = near.vertices.min(axis=0) - reach - 3 * step
-    shape = np.ceil((near.vertices.max(axis=0) + reach + 3 * step - low) / step) + 1
+    step = float(reach) / _STEP
+    low = surface.vertices.min(axis=0) - reach - 3 * step
+    shape = np.ceil((surface.vertices.max(axis=0) + reach + 3 * step - low) / step) + 1
     if (count := math.prod(shape.tolist())) > _MOST:
         least = reach * (count / _MOST) ** (1 / 3)
         raise InputError(
             f"{surface.name} wrap is {reach:g}, which is too small for its extent; use {least:.2g} or more"
         )
-    grid = _Sampled(low, step, shape.astype(int))
-    samples = _Samples(near, step)
-    away = grid.distance(samples, 2 * reach)
-    part = scipy.ndimage.label(away > reach)[0]
-    sign, at = -1, (0, 0, 0)
-    if inside is not None:
-        sign, at = 1, grid.place(f"{surface.name} inside", inside, middle)
-        if not part[at]:
-            raise InputError(
-                f"{surface.name} inside is {format_point(inside)}, {away[at]:.3g} from the surface, expected a point "
-                f"farther from it than wrap, {reach:g}"
-            )
-        if part[at] == part[0, 0, 0]:
-            where, width = grid.leak(away > reach, at)
-            where = np.clip(where, near.vertices.min(axis=0), near.vertices.max(axis=0))
-            raise InputError(
-                f"{surface.name} inside is {format_point(inside)}, from where a gap {width:.3g} wide leads out at "
-                f"{format_point(middle + where)}, expected a space that is closed but for gaps up to 2 wrap, "
-                f"{2 * reach:g}; close it, or pass repair=True, which closes flat holes"
-            )
-    space = part == part[at]
-    first = grid.level(surface.name, sign * np.where(space, away - reach, -np.abs(away - reach)), _SIMPLER)
-    depth = np.where(space, 0, grid.distance(_Samples(first, step), 1.5 * reach, ~space))
-    made, group = _with_groups(grid.level(surface.name, sign * ((1 - _OFF) * reach - depth)), near, groups, reach)
-    parts = (made.vertices, made.triangles, group, [str(k) for k in range(int(groups.max()) + 1)])
-    made = boolean("+", parts, simpler=_SIMPLER * step)
-    off = samples.distance(made["vertices"]).max()
-    group = made["groups"]
-    made = Surface(made["vertices"] + middle, made["triangles"], surface.name)
-    return made, group, f"wrapped, at most {off:.3g} away from what was given"
+    return _Sampled(low, step, shape.astype(int))
 
 
 class _Sampled:
@@ -139,6 +147,33 @@ class _Sampled:
         found = np.full(self.shape, reach)
         found[near] = np.minimum(to.distance(self.low + self.step * np.argwhere(near)), reach)
         return found
+
+    def space(
+        self, away: np.ndarray, reach: float, inside: Sequence[float] | None, middle: np.ndarray, surface: Surface
+    ) -> np.ndarray:
+        """Return which points lie in the space around a surface, or around a point, (i, j, k) bool.
+
+        - `away`: distances of all points from the surface
+        - `inside`: a point; the origin of the surface lies at `middle`
+        """
+        part = scipy.ndimage.label(away > reach)[0]
+        if inside is None:
+            return part == part[0, 0, 0]
+        at = self.place(f"{surface.name} inside", inside, middle)
+        if not part[at]:
+            raise InputError(
+                f"{surface.name} inside is {format_point(inside)}, {away[at]:.3g} from the surface, expected a point "
+                f"farther from it than wrap, {reach:g}"
+            )
+        if part[at] == part[0, 0, 0]:
+            where, width = self.leak(away > reach, at)
+            where = np.clip(where, surface.vertices.min(axis=0), surface.vertices.max(axis=0))
+            raise InputError(
+                f"{surface.name} inside is {format_point(inside)}, from where a gap {width:.3g} wide leads out at "
+                f"{format_point(middle + where)}, expected a space that is closed but for gaps up to 2 wrap, "
+                f"{2 * reach:g}; close it, or pass repair=True, which closes flat holes"
+            )
+        return part == part[at]
 
     def place(self, what: str, point: Sequence[float], origin: np.ndarray) -> tuple[int, ...]:
         """Return the indices of the grid point nearest to a point that is given with another origin."""
@@ -309,8 +344,6 @@ def _away(surface: Surface, points: np.ndarray, reach: float) -> np.ndarray:
 
     So the surface that faces them is the nearer one where two have the same nearest point, on their common edge.
     """
-    from .solid import NearestTriangles
-
     feet = NearestTriangles(surface, np.arange(len(surface))).feet(points, reach)
     a, b, c = np.moveaxis(surface.corners[feet.triangle], 1, 0)
     normal = np.cross(b - a, c - a)

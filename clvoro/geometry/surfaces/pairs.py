@@ -22,7 +22,7 @@ from ...errors import InputError
 from ..domain import Domain
 from ..fixed_generators import FixedGenerators
 from ..lines.pairs import choose_angles
-from ..solid.solid import Feet, NearestTriangles
+from ..nearest_triangles import Feet, NearestTriangles
 from ..solid.stations import AroundCreases, ChainOfChords, Line, share_corners
 from .sheets import Sheets
 

@@ -12,8 +12,8 @@ import scipy
 from ...arguments import format_point
 from ...errors import InputError
 from ..bvh import Tree
+from ..nearest_triangles import Feet, NearestTriangles
 from ..solid.creases import connect, corner_normals, find_chains, triangle_normals
-from ..solid.solid import Feet, NearestTriangles
 from ..surface import Surface
 from ..triangles import segment_distance2
 

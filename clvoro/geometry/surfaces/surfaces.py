@@ -14,11 +14,12 @@ import scipy
 
 from ...arguments import format_point
 from ...errors import InputError, InputTypeError
+from ...files import pack_array, unpack_array
 from ..borders import Borders, Size
 from ..columns import Columns
 from ..domain import Domain
 from ..fixed_generators import FixedGenerators
-from ..solid.solid import Solid, pack_array, unpack_array
+from ..solid.solid import Solid
 from ..surface import Surface
 from ..surface_files import SOLIDS, FilePart, parts_of, read_parts, word
 from .pairs import place_pairs
