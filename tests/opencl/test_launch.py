@@ -25,11 +25,6 @@ kernel void put(const int n, const double x, const int2 shift, global const doub
 
 
 @pytest.fixture
-def engine(ctx):
-    return Engine(ctx, cl.CommandQueue(ctx), 2, np.dtype(np.float64))
-
-
-@pytest.fixture
 def settings(monkeypatch):
     """The numbers of the arguments that each call of `set_changed` sets."""
     plain, calls = kernels.set_changed, []

@@ -12,14 +12,8 @@ import pytest
 
 import clvoro
 from clvoro.opencl import program, runtimes
-from clvoro.opencl.engine import Engine
 from clvoro.opencl.program import source_text
 from clvoro.sizing.expression import _FUNCTIONS
-
-
-@pytest.fixture
-def engine(ctx):
-    return Engine(ctx, cl.CommandQueue(ctx), 2, np.dtype(np.float64))
 
 
 def test_program_is_built_for_its_first_kernel(engine, monkeypatch):

@@ -18,11 +18,6 @@ from tests.reference import patch
 
 
 @pytest.fixture
-def engine(ctx):
-    return Engine(ctx, cl.CommandQueue(ctx), 2, np.dtype(np.float64))
-
-
-@pytest.fixture
 def made(monkeypatch):
     """Sizes of the buffers that were allocated."""
     sizes, plain = [], cl.Buffer

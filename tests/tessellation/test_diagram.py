@@ -20,16 +20,6 @@ BOX = clvoro.Box((0.0, 0.0), (2.5, 1.5))
 COLLAPSED = 4  # FLAG_COLLAPSED of tessellation/report.h
 
 
-@pytest.fixture(scope="module", params=["float64", "float32"])
-def adapter(request):
-    return clvoro.Adapter(dtype=request.param)
-
-
-@pytest.fixture(scope="module")
-def adapter64():
-    return clvoro.Adapter(dtype="float64")
-
-
 def lattice(nx, ny, box=BOX):
     lower, extent = np.array(box.lower), box.extent
     ij = np.stack(np.meshgrid(np.arange(nx), np.arange(ny), indexing="ij"), axis=-1).reshape(-1, 2)

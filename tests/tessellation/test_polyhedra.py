@@ -19,16 +19,6 @@ from tests.reference.diagrams3d import LATTICES, directions, lattice
 BOX = clvoro.Box((0.0, 0.0, 0.0), (2.0, 1.5, 1.0))
 
 
-@pytest.fixture(scope="module", params=["float64", "float32"])
-def adapter(request):
-    return clvoro.Adapter(dtype=request.param)
-
-
-@pytest.fixture(scope="module")
-def adapter64():
-    return clvoro.Adapter(dtype="float64")
-
-
 def hexagonal(k, close_packed):
     j, i, layer = np.meshgrid(*[np.arange(k)] * 3, indexing="ij")
     if close_packed:

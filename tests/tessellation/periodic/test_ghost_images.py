@@ -21,11 +21,6 @@ STEP = 257 / 2**14
 """Unit of positions and depths, so that some are equal. No block begins at a multiple of it."""
 
 
-@pytest.fixture(scope="module", params=["float64", "float32"])
-def adapter(ctx, request):
-    return clvoro.Adapter(ctx, request.param)
-
-
 def bits(x):
     """Return the bits of a float as an integer."""
     return int(np.float32(x).view(np.int32))

@@ -21,11 +21,6 @@ WALLED = {
 NOISE = {"float64": 1e-5, "float32": 1e-4}
 
 
-@pytest.fixture(scope="module", params=["float64", "float32"])
-def adapter(ctx, request):
-    return clvoro.Adapter(ctx, request.param)
-
-
 def lattice(box, count, rng):
     """Return a perturbed body-centered lattice: no four points nearly in a plane or on a circle."""
     cubes = np.indices((count,) * box.dim).reshape(box.dim, -1).T

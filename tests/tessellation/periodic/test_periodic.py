@@ -25,11 +25,6 @@ ROUNDING = {"float64": 1e-12, "float32": 2e-5}
 """Tolerance of a volume over the mean volume: about 1e4 eps, since corners are quotients of differences of squares."""
 
 
-@pytest.fixture(scope="module", params=["float64", "float32"])
-def adapter(ctx, request):
-    return clvoro.Adapter(ctx, request.param)
-
-
 @pytest.fixture(scope="module")
 def double(ctx):
     return clvoro.Adapter(ctx)

@@ -14,11 +14,6 @@ CUBE = clvoro.Box((0, 0, 0), (1, 1, 1))
 TORUS = clvoro.Box((0, 0, 0), (1, 1, 1), periodic=True)
 
 
-@pytest.fixture(scope="module", params=["float64", "float32"])
-def adapter(request):
-    return clvoro.Adapter(dtype=request.param)
-
-
 def turned(points):
     """Turn a set in the unit cube, so that it is parallel to no wall."""
     turn, _ = np.linalg.qr(np.random.default_rng(1).standard_normal((3, 3)))
