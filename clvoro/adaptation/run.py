@@ -504,12 +504,7 @@ class Run:
 
     def _read_result(self) -> Result:
         """Read the mesh. Raises InputError if cells of nearly coincident generators are wrong because of round-off."""
-        mesh, final = self.state, self.final
-        if not self._is_part and self.steps and (final is None or self.rows[-1]["step"] == self.rows[-2]["step"]):
-            # The last step was not known in advance, or generators have changed since.
-            assert self.last is not None
-            with mesh.engine.workspace.frame():
-                final = mesh.displacements(self.last.step(mesh))
+        mesh, final = self.state, self._final_displacements()
         if mesh.finalize():
             # Faces shorter than round-off may have changed, and with them the quality.
             for name, value in self._qualities(mesh.summaries.read()).items():
@@ -537,9 +532,8 @@ class Run:
         if (home := diagram.home) is not None:
             # Cells may have been cut along creases: further parts come last. Generators in thin places may have none.
             own, home = home >= 0, np.where(home < 0, -1 - home, home)
-            size, origin, fixed = size[home], np.where(own, origin[home], -1), fixed[home[own & (home < len(fixed))]]
-            if (after := mesh.setup.after_layers) is not None:
-                size = np.where(diagram.layer > 0, np.cbrt(diagram.volumes), mesh.size_factor * after(diagram.points))
+            origin, fixed = np.where(own, origin[home], -1), fixed[home[own & (home < len(fixed))]]
+            size = self._sizes_in_mesh(diagram, size[home])
             error, quality = self._measured_again(diagram, size)
         put_back(diagram, self._domain, fixed[labels[labels < len(fixed)]] if self._is_part else fixed)
         result = Result(
@@ -559,6 +553,22 @@ class Run:
             parts=parts,
         )
         return without_holes(result)
+
+    def _final_displacements(self) -> Displacements | None:
+        """Return those of the last step, computed again if it was not known in advance or generators have changed."""
+        known = self.final is not None and (len(self.rows) < 2 or self.rows[-1]["step"] != self.rows[-2]["step"])
+        if self._is_part or not self.steps or known:
+            return self.final
+        assert self.last is not None
+        with self.state.engine.workspace.frame():
+            return self.state.displacements(self.last.step(self.state))
+
+    def _sizes_in_mesh(self, diagram: Diagram, size: np.ndarray) -> np.ndarray:
+        """Return the target sizes of the cells of `diagram`, in a solid, after layers have compressed them."""
+        after, factor = self.state.setup.after_layers, self.state.size_factor
+        if after is None:
+            return size
+        return np.where(diagram.layer > 0, np.cbrt(diagram.volumes), factor * after(diagram.points))
 
     def _measured_again(self, diagram: Diagram, size: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return error and quality of the cells of `diagram`, in a solid, and put their figures into the history.

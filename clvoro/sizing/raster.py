@@ -74,37 +74,10 @@ def grid_scattered(
     method: str,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the values on a raster's nodes and its corners; see `Scattered`."""
-    x = coordinates("Scattered points", points, 2)
-    given = np.asarray(values)
-    if given.dtype.kind not in "fiu":
-        raise InputTypeError(f"Scattered values are of type {given.dtype}, expected real numbers")
-    if given.shape != (len(x),):
-        raise InputError(f"Scattered values have shape {given.shape} for {len(x)} points, expected ({len(x)},)")
-    if not len(x):
-        raise InputError("Scattered got no points, expected at least one")
-    bad = np.flatnonzero(~np.isfinite(given))
-    if bad.size:
-        raise InputError(
-            f"Scattered values[{bad[0]}] is {given[bad[0]]}, expected finite numbers ({bad.size} "
-            f"of {len(x)} are not); leave these points out"
-        )
+    x, given, low, high = _checked_points(points, values, lower, upper)
     if method not in ("linear", "nearest"):
         raise InputError(f"Scattered got method={method!r}, expected 'linear' or 'nearest'")
-    low, high = (
-        np.asarray(end if corner is None else corner, dtype=float)
-        for corner, end in ((lower, x.min(axis=0)), (upper, x.max(axis=0)))
-    )
     d = x.shape[1]
-    if low.shape != (d,) or high.shape != (d,) or not (low < high).all():
-        raise InputError(
-            f"Scattered covers {low.tolist()} to {high.tolist()}, expected {d} coordinates each "
-            "with lower < upper; pass lower and upper"
-        )
-    if ((x.max(axis=0) < low) | (x.min(axis=0) > high)).any():
-        raise InputError(
-            f"Scattered got points from {x.min(axis=0).tolist()} to {x.max(axis=0).tolist()}, all outside of the box "
-            f"from {low.tolist()} to {high.tolist()}; do units and the order of the coordinates (x, y) agree?"
-        )
     extent = high - low
     if resolution is None:
         spacing = max(0.5 * (np.prod(extent) / len(x)) ** (1 / d), 1.05 * (np.prod(extent) / _MAX_NODES) ** (1 / d))
@@ -120,12 +93,50 @@ def grid_scattered(
         counts = asked if asked.ndim else np.maximum(along, 1) + 1
     axes = [np.linspace(0, e, n) for e, n in zip(extent, counts, strict=True)]
     nodes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, d)
-    found = _interpolate(x - low, given.astype(float), nodes, method)
+    found = _interpolate(x - low, given, nodes, method)
     return found.reshape(counts).T, low, high
 
 
-def _interpolate(x: np.ndarray, values: np.ndarray, nodes: np.ndarray, method: str) -> np.ndarray:
+def _checked_points(
+    points: object, values: object, lower: Sequence[float] | None, upper: Sequence[float] | None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return the points (n, d) and values (n,) of `Scattered`, and the corners (d,) of its raster.
 
+    Raises `InputError` or `InputTypeError` if they are not finite, do not match, or no point is in the raster.
+    """
+    x = coordinates("Scattered points", points, 2)
+    given = np.asarray(values)
+    if given.dtype.kind not in "fiu":
+        raise InputTypeError(f"Scattered values are of type {given.dtype}, expected real numbers")
+    if given.shape != (len(x),):
+        raise InputError(f"Scattered values have shape {given.shape} for {len(x)} points, expected ({len(x)},)")
+    if not len(x):
+        raise InputError("Scattered got no points, expected at least one")
+    bad = np.flatnonzero(~np.isfinite(given))
+    if bad.size:
+        raise InputError(
+            f"Scattered values[{bad[0]}] is {given[bad[0]]}, expected finite numbers ({bad.size} "
+            f"of {len(x)} are not); leave these points out"
+        )
+    low, high = (
+        np.asarray(end if corner is None else corner, dtype=float)
+        for corner, end in ((lower, x.min(axis=0)), (upper, x.max(axis=0)))
+    )
+    d = x.shape[1]
+    if low.shape != (d,) or high.shape != (d,) or not (low < high).all():
+        raise InputError(
+            f"Scattered covers {low.tolist()} to {high.tolist()}, expected {d} coordinates each "
+            "with lower < upper; pass lower and upper"
+        )
+    if ((x.max(axis=0) < low) | (x.min(axis=0) > high)).any():
+        raise InputError(
+            f"Scattered got points from {x.min(axis=0).tolist()} to {x.max(axis=0).tolist()}, all outside of the box "
+            f"from {low.tolist()} to {high.tolist()}; do units and the order of the coordinates (x, y) agree?"
+        )
+    return x, given.astype(float), low, high
+
+
+def _interpolate(x: np.ndarray, values: np.ndarray, nodes: np.ndarray, method: str) -> np.ndarray:
     found = np.full(len(nodes), np.nan)
     if method == "linear":
         _check_duplicates(x, values)

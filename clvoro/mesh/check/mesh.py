@@ -384,6 +384,27 @@ def check_solid(check: Check, g: Rebuilt) -> None:
     check.compare("face measures", d.face_measures, g.measures, slack * g.reach[g.owner])
     _check_sum(check, g.owner, g.areas, slack * g.reach)
     _check_closed(check, g, slack)
+    corners = _check_walls_of_solid(check, slack)
+    inner = np.ones(len(d.vertices), bool)
+    inner[corners] = False
+    if domain.sheets is not None:
+        placed = np.unique(take_rows(faces.starts, faces.corners, d.border_faces)[1])
+        placed = placed[inner[placed]]
+        off = domain.sheets.distance(d.vertices[placed])
+        check.note(
+            "surfaces inside",
+            np.maximum(off - 10 * slack, 0),
+            lambda k: f"vertex {placed[k]} of a face on a surface inside is off it by {off[k]:.3g}",
+        )
+        inner[placed] = False
+    if not d.layer.any():  # else inner vertices have made room for layers
+        _check_nearest_of_solid(check, g, np.flatnonzero(inner[g.corners]), slack)
+
+
+def _check_walls_of_solid(check: Check, slack: float) -> np.ndarray:
+    """Check wall vertices and the sum of the volumes; return the vertices of faces on walls, (k,) int."""
+    d = check.diagram
+    faces, domain = d.faces, d.domain
     wall = faces.starts[faces.n_inner]
     corners = np.unique(faces.corners[wall:])
     # Faces towards cells that `subset` removed are not on the surface.
@@ -410,21 +431,12 @@ def check_solid(check: Check, g: Rebuilt) -> None:
         np.array([abs(total - domain.measure) > most]),
         lambda _: f"the volumes' sum is {total:.17g}, expected {domain.measure:.17g} up to {most:.3g}",
     )
-    inner = np.ones(len(d.vertices), bool)
-    inner[corners] = False
-    if domain.sheets is not None:
-        placed = np.unique(take_rows(faces.starts, faces.corners, d.border_faces)[1])
-        placed = placed[inner[placed]]
-        off = domain.sheets.distance(d.vertices[placed])
-        check.note(
-            "surfaces inside",
-            np.maximum(off - 10 * slack, 0),
-            lambda k: f"vertex {placed[k]} of a face on a surface inside is off it by {off[k]:.3g}",
-        )
-        inner[placed] = False
-    if d.layer.any():  # inner vertices have made room for layers
-        return
-    kept = np.flatnonzero(inner[g.corners])
+    return corners
+
+
+def _check_nearest_of_solid(check: Check, g: Rebuilt, kept: np.ndarray, slack: float) -> None:
+    """Check that the corners `kept` (k,) int of cells are nearest to the generators of these, up to `MOVED`."""
+    d = check.diagram
     x, own = d.vertices[g.corners[kept]], g.cells[kept]
     # Parts of cells that have been cut come last, with their centroids as generators.
     whole = np.flatnonzero(np.linalg.norm(d.points - d.centroids, axis=1) > slack)
