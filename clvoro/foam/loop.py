@@ -431,20 +431,7 @@ class _Loop:
             options=MultilevelOptions(correct=bool(self.window)),
         )
         mesh_seconds = time.perf_counter() - start
-        zones = old.zones_on(made.diagram)
-        make_folder(case.own)
-        target = case.own / f"next-{latest.name}"
-        shutil.rmtree(target, ignore_errors=True)
-        types = cast(dict[str, PatchType], {name: foam.types[name] for name in domain.boundary_names})
-        target.mkdir()
-        if (case.folder / latest.name / "uniform").is_dir():
-            shutil.copytree(case.folder / latest.name / "uniform", target / "uniform")
-        if why := rejection(made.solver_mesh()):
-            warn(why, MismatchWarning)
-        made.to_openfoam(target / "polyMesh", types=types, thickness=foam.thickness, zones=zones, check=False)
-        foam.keep_groups(target / "polyMesh" / "boundary")
-        made.save(target / "polyMesh" / _MESH)
-        new = MeshOfCase.of(FoamMesh.read(target / "polyMesh"), made.diagram)
+        target, new = self._write_mesh(made, old, latest)
         start = time.perf_counter()
         for moved in transfer_fields(fields, old, new, self.adapter):
             moved.write(target / moved.name, latest.name)
@@ -465,6 +452,24 @@ class _Loop:
         self.read = {case.folder / latest.name / "polyMesh": new.foam}
         self._keep(done)
         return done
+
+    def _write_mesh(self, made: Result, old: MeshOfCase, latest: Time) -> tuple[Path, MeshOfCase]:
+        """Write the next mesh into a folder of its own, which is to take the place of the latest time."""
+        case, foam, zones = self.case, old.foam, old.zones_on(made.diagram)
+        make_folder(case.own)
+        target = case.own / f"next-{latest.name}"
+        shutil.rmtree(target, ignore_errors=True)
+        names = old.diagram.domain.boundary_names
+        types = cast(dict[str, PatchType], {name: foam.types[name] for name in names})
+        target.mkdir()
+        if (case.folder / latest.name / "uniform").is_dir():
+            shutil.copytree(case.folder / latest.name / "uniform", target / "uniform")
+        if why := rejection(made.solver_mesh()):
+            warn(why, MismatchWarning)
+        made.to_openfoam(target / "polyMesh", types=types, thickness=foam.thickness, zones=zones, check=False)
+        foam.keep_groups(target / "polyMesh" / "boundary")
+        made.save(target / "polyMesh" / _MESH)
+        return target, MeshOfCase.of(FoamMesh.read(target / "polyMesh"), made.diagram)
 
     def _warn_of_lost_fields(self, fields: Sequence[FoamField], foam: FoamMesh, time: Time) -> None:
         """Warn of the fields and folders of the latest time that are not transferred to the next mesh."""
