@@ -402,6 +402,12 @@ def test_mergers_losses_and_collapses_change_what_they_name(ctx):
         assert volume(trial, trial.touched) == pytest.approx(volume(edits, trial.touched) - less, rel=0.01)
     counts = [len(t.vertices(cell)) for t in cures.collapses(edits, cell) if t.is_sound(cell)]
     assert 3 < min(counts) <= max(counts) < len(edits.vertices(cell))
+    names = edits.mesh.domain.boundaries.index
+    walls = {c: [n for k in edits.faces_of(c) if (n := edits.across(k, c)) < 0] for c in range(edits.mesh.n_cells)}
+    cell = max(walls, key=lambda c: len(walls[c]))
+    joined = [[t.across(k, cell) for k in t.faces_of(cell)] for t in cures.joins(edits, cell) if t.is_sound(cell)]
+    assert len({names[-1 - n] for n in walls[cell]}) == 1
+    assert {sum(n < 0 for n in beyond) for beyond in joined} == {len(walls[cell]) - 1}
 
 
 def test_parts_in_trials_that_are_dropped_leave_no_trace(ctx):

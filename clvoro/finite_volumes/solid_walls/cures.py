@@ -4,7 +4,8 @@ A cell that is concave at an edge, as at a concave crease, is cut in two. Other 
 faces, merge cells, and change or divide faces; the last ones leave out a part of the solid. All are tried on a rejected
 cell. The best one is kept if it leaves fewer cells rejected than before, or as many, but nearer to what is accepted.
 
-At the end faces that are oblique, between cells that OpenFOAM accepts, are turned or collapsed in the same way.
+At the end faces that are oblique, between cells that OpenFOAM accepts, are turned or collapsed in the same way, and
+small wall polygons that are skewed, as at the tips of strips, become parts of others.
 """
 
 from __future__ import annotations
@@ -31,8 +32,9 @@ _LEAST_GAIN = 0.05
 """Where no fewer cells are rejected, a change is kept if their excess, see `judge`, falls by more than this."""
 _FOLDED = 100.0
 """Degrees beyond 180 from which the angle between two faces of a cell counts as folded."""
-_SHORT = 0.25
-"""Length over h below which edges may be collapsed, and faces whose corners are all that near to their mean."""
+_SHORT = 0.25, 0.3
+"""Length over h below which edges may be collapsed, and faces whose corners are all that near to their mean: in cells
+that are rejected, and where faces are oblique or skewed."""
 _SMALL = 0.4
 """Cells with a smaller volume, over h^3, may be merged with a neighbor; new parts of cells always may."""
 _TURNS = (0.3, 0.6, 1.0)
@@ -42,6 +44,8 @@ _REACH = 0.3
 _SLIVER, _TIP, _FEW = 0.05, 0.4, 4
 """Cells at walls with a volume below `_SLIVER`, over h^3, may be left out; below `_TIP` with fewer than `_FEW` faces to
 others. So may up to `_FEW` cells without faces to others."""
+_TIP_AREA = 0.2
+"""Wall polygons with a smaller area, over h^2, may be joined with others where they are skewed."""
 _TOO_MANY = 0.2
 """Share of rejected cells above which no cure is tried: the solid is as thin as a cell."""
 _BUDGET, _MOST = 12, 1000
@@ -204,7 +208,7 @@ class Cures:
         if (edits, cell, last) not in self.judged:
             cures = [self.cuts, self.transfers, self.collapses, self.mergers, self.halves]
             if self.strictly:
-                cures = [self.collapses, self.tilts, self.mergers]
+                cures = [self.collapses, self.tilts, self.mergers, self.joins]
             if last:
                 cures = [self.unions, self.losses]
             self.judged[edits, cell, last] = self._judged(edits, [t for cure in cures for t in cure(edits, cell)])
@@ -322,14 +326,14 @@ class Cures:
 
     def collapses(self, edits: Edits, cell: int) -> Iterator[Edits]:
         """Collapse a short edge or a small face of a cell."""
-        h = self.h(edits, cell)
-        groups: set[frozenset[int]] = set()
+        h, groups = self.h(edits, cell), set[frozenset[int]]()
+        short = _SHORT[self.strictly] * h
         for k in edits.faces_of(cell):
             loop = edits.face(k)[2]
             x = edits.positions(loop)
             length = np.linalg.norm(x - np.roll(x, -1, axis=0), axis=1)
-            groups |= {frozenset(e) for e, far in zip(edges_of(loop), length.tolist(), strict=True) if far < _SHORT * h}
-            if np.linalg.norm(x - x.mean(axis=0), axis=1).max() < _SHORT * h:
+            groups |= {frozenset(e) for e, far in zip(edges_of(loop), length.tolist(), strict=True) if far < short}
+            if np.linalg.norm(x - x.mean(axis=0), axis=1).max() < short:
                 groups.add(frozenset(loop))
         for group in sorted(groups, key=sorted):
             vertices = sorted(group)
@@ -400,6 +404,21 @@ class Cures:
                         owner, neighbor, corners = trial.face(k)
                         trial.put(k, owner, neighbor, [a for a in corners if a != v])
                 yield trial
+
+    def joins(self, edits: Edits, cell: int) -> Iterator[Edits]:
+        """Join a small wall polygon, as at the tip of a strip, with one of the cell that has the same name."""
+        h, name = self.h(edits, cell), self.surface.solid.boundaries.index
+        walls = {k: edits.seen(k, cell) for k in sorted(edits.faces_of(cell)) if edits.across(k, cell) < 0}
+        for small, loop in walls.items():
+            if np.linalg.norm(area_of(edits.positions(loop))) < _TIP_AREA * h**2:
+                for k, around in walls.items():
+                    wall, joined = edits.across(k, cell), _joined(loop, around)
+                    if joined is not None and name[-1 - wall] == name[-1 - edits.across(small, cell)]:
+                        trial = edits.trial()
+                        trial.drop(small)
+                        trial.drop(k)
+                        trial.add(cell, wall, joined)
+                        yield trial
 
     def halves(self, edits: Edits, cell: int) -> Iterator[Edits]:
         """Divide a wall polygon along a diagonal."""

@@ -489,7 +489,7 @@ def _region(edits: Edits, cells: tuple[int, ...]) -> _Region:
         for n in edits.neighbors(c):
             if not edits.is_vast(n):
                 number.setdefault(n, len(number))
-    owner, neighbor, counts, corners, vertex = list[int](), list[int](), list[int](), list[int](), dict[int, int]()
+    owner, neighbor, counts, corners = list[int](), list[int](), list[int](), list[int]()
     for k in set().union(*(edits.faces_of(c) for c in number)):
         i, j, loop = edits.face(k)
         if i not in number:
@@ -500,9 +500,9 @@ def _region(edits: Edits, cells: tuple[int, ...]) -> _Region:
         owner.append(a)
         neighbor.append(b)
         counts.append(len(loop))
-        corners += [vertex.setdefault(v, len(vertex)) for v in loop]
-    arrays = (np.array(x, np.int64) for x in (owner, neighbor, counts, corners))
-    return _Region(*arrays, list(vertex), len(number))
+        corners += loop
+    vertices, rows = np.unique(np.array(corners, np.int64), return_inverse=True)
+    return _Region(*(np.array(x, np.int64) for x in (owner, neighbor, counts)), rows, vertices.tolist(), len(number))
 
 
 def over_wanted(measures: SolverMeasures) -> np.ndarray:

@@ -593,8 +593,11 @@ class _Maker:
         along = b - a
         share = ((x - a) * along).sum(axis=1) / np.maximum((along**2).sum(axis=1), 1e-300)
         away = np.linalg.norm(x - a - np.clip(share, 0, 1)[:, None] * along, axis=1)
-        missed = chord[fits & (away > _MISSED * self.sizes[crossings.cells[which, 0]])]
-        rows = np.flatnonzero(fits & np.isin(chord, missed))
+        rows = np.flatnonzero(fits)
+        rows = rows[np.lexsort((away[rows], which[rows]))]
+        rows = rows[np.unique(which[rows], return_index=True)[1]]  # each crossing is on the nearest chord
+        missed = chord[rows[away[rows] > _MISSED * self.sizes[crossings.cells[which[rows], 0]]]]
+        rows = rows[np.isin(chord[rows], missed)]
         rows = rows[np.lexsort((-away[rows], chord[rows]))]
         place = np.arange(len(rows)) - np.searchsorted(chord[rows], chord[rows])
         rows = rows[place < 2]  # a face that ends on a strip between two creases crosses both
