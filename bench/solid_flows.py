@@ -68,10 +68,16 @@ def bent_pipe() -> clvoro.Solid:
 # Meshers: each writes the polyMesh of a case.
 
 
-def mesh_clvoro(case: Case, adapter: clvoro.Adapter, solid: clvoro.Solid, n: int) -> None:
-    """Write cells of clvoro."""
-    h = (solid.measure / n) ** (1 / 3)
-    adapter.run(solid, h).to_openfoam(case.folder / "constant" / "polyMesh")
+def mesh_clvoro(layer: float) -> Callable[..., None]:
+    """Return a mesher of cells of clvoro, with a layer of prisms on the body or wall that is so thick in units of h."""
+
+    def mesh(case: Case, adapter: clvoro.Adapter, solid: clvoro.Solid, n: int) -> None:
+        h = (solid.measure / n) ** (1 / 3)
+        walls = [name for name in solid.boundary_names if name in ("body", "wall")]
+        layers = clvoro.Layers(layer * h, edges=walls) if layer else ()
+        adapter.run(solid, h, layers=layers).to_openfoam(case.folder / "constant" / "polyMesh")
+
+    return mesh
 
 
 def mesh_gmsh(dual: bool) -> Callable[..., None]:
@@ -138,7 +144,8 @@ def _tetrahedra(path: Path, solid: clvoro.Solid, edge: float) -> tuple[int, int]
 
 
 MESHERS: dict[str, Callable[..., None]] = {
-    "clvoro": mesh_clvoro,
+    "clvoro": mesh_clvoro(0),
+    "clvoro-layer": mesh_clvoro(0.5),
     "polyDualMesh": mesh_gmsh(True),
     "tetrahedra": mesh_gmsh(False),
 }
@@ -195,7 +202,11 @@ def flow_through_bend(case: Case, mesh: Mesh, reference: dict[str, Any]) -> dict
     )
     case.run("simpleFoam")
     p, u = case.field("p", len(mesh))[:, 0], case.field("U", len(mesh))
-    loss = float((p[mesh.owner[inlet]] * area[inlet]).sum() / area[inlet].sum())
+    # The pressure at the inlet by a fit: cells of all meshers have their centers at other distances from it.
+    near = mesh.centroids[:, 0] < RADIUS - STRAIGHT
+    x = mesh.centroids[near] + [STRAIGHT, 0, 0]
+    terms = np.column_stack([np.ones(len(x)), x, x[:, 0] ** 2])
+    loss = float(np.linalg.lstsq(terms, p[near])[0][0])
     made = {"loss": loss, "points": mesh.centroids, "velocity": u}
     if not reference:
         reference.update(made)

@@ -17,6 +17,7 @@ from ..mesh.faces import Faces
 from ..mesh.geometry import sum_rows
 from .collapse import collapse_short
 from .moves import FEW, MOVES, at_generators, least_bad, moved
+from .solid_walls.balance import balanced, unbalanced
 from .solid_walls.mend import NARROW, cells_of, narrow_faces, rejected_among, with_neighbors
 from .solid_walls.mesh import diagram_of
 
@@ -132,8 +133,32 @@ def _made(diagram: Diagram, sheets: Sheets) -> _OnSurfaces:
             made, rejected, tried = trial, left, 0
         else:
             tried += 1
+    made, rejected = _balanced(made, sheets, rejected)
     made.home = np.arange(len(made)) if diagram.home is None else diagram.home
     return _OnSurfaces(made, rejected)
+
+
+def _balanced(diagram: Diagram, sheets: Sheets, rejected: np.ndarray) -> tuple[Diagram, np.ndarray]:
+    """Return the mesh with balanced faces on curved surfaces, and the cells that OpenFOAM rejects, (k,) int.
+
+    Vertices stay where it would reject other cells than those that it has `rejected` (k,) before.
+    """
+    mesh, rows = diagram.faces, diagram.border_faces
+    feet = sheets.feet(mesh.center[rows])
+    patch, turned = np.where(mesh.neighbor < 0, sheets.n_patches - 1 - mesh.neighbor, -1), np.zeros(len(mesh), bool)
+    patch[rows] = sheets.patch[feet.triangle]
+    turned[rows] = (mesh.vectors[1][rows] * sheets.normals[feet.triangle]).sum(axis=1) < 0
+    bent = np.zeros(patch.max(initial=0) + 1, bool)
+    bent[: sheets.n_patches] = sheets.bent
+    faces, every = balanced(mesh, patch, bent, sheets.nearest, turned), np.ones(len(diagram), bool)
+    if faces is mesh:
+        return diagram, rejected
+    made = diagram_of(faces)
+    made.border_faces = rows
+    if len(worse := np.setdiff1d(_rejected(made, every), rejected)):
+        made = diagram_of(unbalanced(faces, mesh.points, worse)[0])
+        made.border_faces = rows
+    return made, _rejected(made, every)
 
 
 def _rejected(diagram: Diagram, among: np.ndarray) -> np.ndarray:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -86,3 +87,19 @@ def _samples(triangles: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, np
         points.append(np.einsum("sk,tkd->tsd", weights, corners[rows]).reshape(-1, 3))
         item.append(np.repeat(rows, len(weights)))
     return np.concatenate(points), np.concatenate(item)
+
+
+def heights_over(
+    feet: Callable[[np.ndarray], Feet], normals: np.ndarray, corners: np.ndarray, starts: np.ndarray
+) -> np.ndarray:
+    """Return how high a surface is curved over polygons, (f,) float.
+
+    - `feet`: returns the nearest points of the surface.
+    - `normals` (t, 3) float: of its triangles.
+    - `corners` (c, 3) float, `starts` (f + 1,) int: those of each polygon.
+    """
+    foot, counts = feet(corners).point, np.diff(starts)
+    middle = feet(np.add.reduceat(foot, starts[:-1]) / counts[:, None])
+    away = foot - np.repeat(middle.point, counts, axis=0)
+    height = np.abs((away * np.repeat(normals[middle.triangle], counts, axis=0)).sum(axis=1))
+    return np.maximum.reduceat(height, starts[:-1])

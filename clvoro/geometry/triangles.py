@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import DTypeLike
 
 _TOUCH = 1e-9  # of the size of a pair: a smaller overlap counts as contact
+_FLAT = 1e-9  # a patch is flat if its mean normal is shorter than 1 by less than this
 
 
 def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -150,3 +151,12 @@ def areas_of(corners: np.ndarray) -> np.ndarray:
     """Return the areas (t,) of triangles with these corners (t, 3, 3)."""
     a, b, c = np.moveaxis(corners, 1, 0)
     return 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
+
+
+def bent_patches(areas: np.ndarray, normals: np.ndarray, patch: np.ndarray, n_patches: int) -> np.ndarray:
+    """Return whether the triangles of each patch are in more than one plane, (p,) bool.
+
+    - `areas` (t,), `normals` (t, 3) float, `patch` (t,) int: of the triangles.
+    """
+    total = [np.bincount(patch, areas * x, n_patches) for x in normals.T]
+    return np.linalg.norm(total, axis=0) < (1 - _FLAT) * np.bincount(patch, areas, n_patches)

@@ -1,40 +1,49 @@
-"""Move the vertices of curved walls so that each wall polygon cuts off as much of the solid as it adds."""
+"""Move the vertices of curved surfaces so that each polygon on them cuts off as much of a cell as it adds."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
+from typing import TypeAlias
 
 import numpy as np
 
 from ...mesh.connectivity import following, rows_with, take_rows
 from ...mesh.faces import Faces
 from .mend import cells_of
-from .wall_surface import WallSurface
 
+Feet: TypeAlias = Callable[[np.ndarray], np.ndarray]
+"""Returns the closest point of a surface to each of some points (k, 3)."""
 _DEEPEST = 0.15
 """Largest depth of a polygon below the surface that is balanced, over the root of its area: where details are smaller
 than polygons, depths do not follow from the curvature."""
 _INNER = 0.01
 """A vertex stays in the planes of the faces between cells, and moves off its walls by their depths. Where it cannot do
-both, the planes count this much, the depths 1."""
+both, the planes count this much, the depths 1. It never leaves flat patches."""
 _LONGEST = 2.0
 """Longest way of a vertex, over the largest depth of the wall polygons around it."""
 
 
-def balanced(surface: WallSurface, faces: Faces) -> Faces:
-    """Return `faces` with vertices of curved walls moved by the mean depth of the wall polygons below the surface.
+def balanced(faces: Faces, patch: np.ndarray, bent: np.ndarray, feet: Feet, turned: np.ndarray | None = None) -> Faces:
+    """Return `faces` with vertices of curved surfaces moved by the mean depth of their polygons below the surface.
 
     Chords of a curved surface cut off a volume of second order. Vertices stay in the planes of the faces between cells,
     along whose common edges they move, and in those of flat walls.
+
+    - `patch` (f,) int: the smooth patch that a face lies on, -1 for those that are on none.
+    - `bent` (p,) bool: which patches are curved and balanced.
+    - `feet`: returns the closest points of the surface.
+    - `turned` (f,) bool: faces whose normals point to the other side than those of others on the patch.
     """
     center, vector = faces.vectors
-    normal = vector / np.maximum(np.linalg.norm(vector, axis=1), 1e-300)[:, None]
-    patch = np.where(faces.neighbor < 0, -1 - faces.neighbor, 0)
-    curved = np.flatnonzero((faces.neighbor < 0) & surface.bent[patch])
+    curved = np.flatnonzero((patch >= 0) & bent[patch])
     if not len(curved):
         return faces
+    if turned is not None:
+        vector = np.where(turned[:, None], -vector, vector)
+    normal = vector / np.maximum(np.linalg.norm(vector, axis=1), 1e-300)[:, None]
     depth = np.zeros(len(faces))
-    depth[curved] = _depths(surface, faces, curved, center, normal)
+    depth[curved] = _depths(feet, faces, curved, center, normal)
     moved = np.zeros(len(faces.points), bool)
     moved[take_rows(faces.starts, faces.corners, curved)[1]] = True
     around = np.flatnonzero(rows_with(faces.starts, moved[faces.corners]))
@@ -42,21 +51,23 @@ def balanced(surface: WallSurface, faces: Faces) -> Faces:
     face = np.repeat(around, np.diff(starts))[moved[corners]]
     vertex = (np.cumsum(moved) - 1)[corners[moved[corners]]]
     # One plane for each patch at a vertex, and one for each inner face; polygons count by their areas.
-    key = vertex * (len(surface.bent) + len(faces)) + np.where(
-        faces.neighbor[face] < 0, patch[face], len(surface.bent) + face
-    )
+    key = vertex * (len(bent) + len(faces)) + np.where(patch[face] >= 0, patch[face], len(bent) + face)
     _, first, place = np.unique(key, return_index=True, return_inverse=True)
     total = np.maximum(np.bincount(place, faces.area[face]), 1e-300)
     planes = np.stack([np.bincount(place, vector[face, k]) for k in range(3)], axis=1)
     planes /= np.maximum(np.linalg.norm(planes, axis=1), 1e-300)[:, None]
     wanted = np.bincount(place, faces.area[face] * depth[face]) / total
-    vertex, weight = vertex[first], np.where(faces.neighbor[face[first]] < 0, 1.0, _INNER)
-    n = np.count_nonzero(moved)
-    matrix, right, most = np.zeros((n, 3, 3)), np.zeros((n, 3)), np.zeros(n)
-    np.add.at(matrix, vertex, (weight[:, None] * planes)[:, :, None] * planes[:, None, :])
+    vertex, patch = vertex[first], patch[face[first]]
+    n, held = np.count_nonzero(moved), (patch >= 0) & ~bent[patch]
+    squares = planes[:, :, None] * planes[:, None, :]
+    matrix, flat, right, most = np.zeros((n, 3, 3)), np.zeros((n, 3, 3)), np.zeros((n, 3)), np.zeros(n)
+    np.add.at(matrix, vertex, np.where(patch >= 0, 1.0, _INNER)[:, None, None] * squares)
+    np.add.at(flat, vertex[held], squares[held])
     np.add.at(right, vertex, wanted[:, None] * planes)
     np.maximum.at(most, vertex, np.abs(wanted))
-    way = np.einsum("vij,vj->vi", np.linalg.pinv(matrix, rcond=1e-4, hermitian=True), right)
+    along = np.eye(3) - np.linalg.pinv(flat, rcond=1e-4, hermitian=True) @ flat  # within the planes of flat patches
+    inverse = np.linalg.pinv(along @ matrix @ along, rcond=1e-4, hermitian=True)
+    way = np.einsum("vij,vj->vi", along @ inverse @ along, right)
     way *= np.minimum(1, _LONGEST * most / np.maximum(np.linalg.norm(way, axis=1), 1e-300))[:, None]
     points = faces.points.copy()
     points[moved] += way
@@ -75,9 +86,7 @@ def unbalanced(faces: Faces, chords: np.ndarray, cells: np.ndarray) -> tuple[Fac
     return replace(faces, points=points), cells_of(faces, rows_with(faces.starts, back[faces.corners]))
 
 
-def _depths(
-    surface: WallSurface, faces: Faces, walls: np.ndarray, center: np.ndarray, normal: np.ndarray
-) -> np.ndarray:
+def _depths(feet: Feet, faces: Faces, walls: np.ndarray, center: np.ndarray, normal: np.ndarray) -> np.ndarray:
     """Return the mean depth of the polygons `walls` (k,) below the surface, along their normals, (k,) float.
 
     Means are those of the middles of the sides of the triangles around the center: exact if the depth is a quadratic.
@@ -86,7 +95,7 @@ def _depths(
     row = np.repeat(np.arange(len(walls)), np.diff(starts))
     a, b, c = faces.points[corners], faces.points[corners[following(starts)]], center[walls][row]
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
-    outer, inner = (((surface.feet(x) - x) * normal[walls][row]).sum(axis=1) for x in ((a + b) / 2, (a + c) / 2))
+    outer, inner = (((feet(x) - x) * normal[walls][row]).sum(axis=1) for x in ((a + b) / 2, (a + c) / 2))
     depth = (outer + inner + inner[following(starts)]) / 3
     total = np.maximum(np.bincount(row, area), 1e-300)
     most = _DEEPEST * np.sqrt(faces.area[walls])

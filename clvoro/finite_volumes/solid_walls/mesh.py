@@ -326,7 +326,7 @@ def _finished(
     tell("short edges at walls")
     faces, changed = _collapsed(raw.faces, near.sizes[home])
     chords = faces.points
-    faces = balanced(surface, faces)
+    faces = balanced(faces, np.maximum(-1 - faces.neighbor, -1), surface.bent, surface.feet)
     tell("checks of cells at walls")
     changed |= touching_walls(faces)
     rejected = rejected_at_walls(faces, changed)

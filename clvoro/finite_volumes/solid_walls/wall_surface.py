@@ -10,6 +10,7 @@ import numpy as np
 import scipy
 
 from ...geometry.bvh import Tree
+from ...geometry.triangles import bent_patches
 from ...mesh.connectivity import distinct, take_rows
 
 if TYPE_CHECKING:
@@ -19,8 +20,6 @@ SNAP_CREASE = 0.06
 """Wall vertices this close to a crease, as a share of h, are moved onto it."""
 SNAP_CORNER = 0.12
 """The same for corners."""
-_FLAT = 1e-9
-"""A patch is flat if its mean normal is shorter than 1 by less than this."""
 
 
 class WallSurface:
@@ -59,9 +58,7 @@ class WallSurface:
     @cached_property
     def bent(self) -> np.ndarray:
         """Whether the triangles of each patch are in more than one plane, (p,) bool."""
-        area = self.solid.surface.areas
-        normal = [np.bincount(self.patch, area * x, self.n_patches) for x in self.solid.normals.T]
-        return np.linalg.norm(normal, axis=0) < (1 - _FLAT) * np.bincount(self.patch, area, self.n_patches)
+        return bent_patches(self.solid.surface.areas, self.solid.normals, self.patch, self.n_patches)
 
     def closest(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the closest triangle (k,), the point on it (k, 3), and the distance (k,), negative inside."""

@@ -19,7 +19,7 @@ from ..boundary_names import BoundaryNames, Walls
 from ..box import Box
 from ..columns import Columns
 from ..domain import Domain
-from ..nearest_triangles import Feet, NearestTriangles
+from ..nearest_triangles import Feet, NearestTriangles, heights_over
 from ..polygon import Polygon
 from ..shapes import Edges
 from ..surface import Surface
@@ -418,11 +418,7 @@ class Solid(Domain):
 
     def heights_over(self, points: np.ndarray, starts: np.ndarray, corners: np.ndarray) -> np.ndarray:
         """Return how high the surface is curved over polygons; see `Domain.heights_over`."""
-        foot, counts = self.feet(points[corners]).point, np.diff(starts)
-        middle = self.feet(np.add.reduceat(foot, starts[:-1]) / counts[:, None])
-        away = foot - np.repeat(middle.point, counts, axis=0)
-        height = np.abs((away * np.repeat(self.normals[middle.triangle], counts, axis=0)).sum(axis=1))
-        return np.maximum.reduceat(height, starts[:-1])
+        return heights_over(self.feet, self.normals, points[corners], starts)
 
     def nearest(self, points: np.ndarray) -> np.ndarray:
         """Return the nearest point of the solid to each of `points` (n, 3)."""

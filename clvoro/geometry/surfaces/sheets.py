@@ -12,10 +12,10 @@ import scipy
 from ...arguments import format_point
 from ...errors import InputError
 from ..bvh import Tree
-from ..nearest_triangles import Feet, NearestTriangles
+from ..nearest_triangles import Feet, NearestTriangles, heights_over
 from ..solid.creases import connect, corner_normals, find_chains, triangle_normals
 from ..surface import Surface
-from ..triangles import segment_distance2
+from ..triangles import bent_patches, segment_distance2
 
 
 @dataclass(frozen=True)
@@ -119,6 +119,20 @@ class Sheets:
         parts = np.split(order, np.searchsorted(self.patch[order], np.arange(1, self.n_patches)))
         return [NearestTriangles(self.surface, part) for part in parts]
 
+    @cached_property
+    def bent(self) -> np.ndarray:
+        """Whether the triangles of each patch are in more than one plane, (p,) bool."""
+        return bent_patches(self.surface.areas, self.normals, self.patch, self.n_patches)
+
+    def feet(self, points: np.ndarray) -> Feet:
+        """Return the nearest points of the surface to `points` (n, 3)."""
+        return self.whole.feet(points, math.inf)
+
+    def heights_over(self, corners: np.ndarray, starts: np.ndarray) -> np.ndarray:
+        """Return how high curved patches are over polygons; see `clvoro.geometry.nearest_triangles.heights_over`."""
+        normals = np.where(self.bent[self.patch][:, None], self.normals, 0)
+        return heights_over(self.feet, normals, corners, starts)
+
     def normals_at(self, feet: Feet) -> np.ndarray:
         """Return unit normals (n, 3) of the patches at points of them."""
         mean = np.einsum("nk,nkd->nd", feet.weights, self.corner_normals[feet.triangle])
@@ -126,11 +140,11 @@ class Sheets:
 
     def distance(self, points: np.ndarray) -> np.ndarray:
         """Return the distances (n,) of `points` (n, 3)."""
-        return self.whole.feet(points, math.inf).distance
+        return self.feet(points).distance
 
     def nearest(self, points: np.ndarray) -> np.ndarray:
         """Return the nearest point of the surface to each of `points` (n, 3)."""
-        return self.whole.feet(points, math.inf).point
+        return self.feet(points).point
 
     @cached_property
     def _edge_tree(self) -> Tree:

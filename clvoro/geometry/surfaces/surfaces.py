@@ -228,7 +228,7 @@ class Surfaces(Borders):
         f, rows = diagram.faces, diagram.border_faces
         if not len(rows):
             return {}
-        feet = self.sheets.whole.feet(f.center[rows], math.inf)
+        feet = self.sheets.feet(f.center[rows])
         part = self.part[feet.triangle]
         against = np.einsum("ij,ij->i", f.normal[rows], self.sheets.normals[feet.triangle]) < 0
         return {name: (rows[part == k], against[part == k]) for k, name in enumerate(self.names) if (part == k).any()}

@@ -388,17 +388,26 @@ def check_solid(check: Check, g: Rebuilt) -> None:
     inner = np.ones(len(d.vertices), bool)
     inner[corners] = False
     if domain.sheets is not None:
-        placed = np.unique(take_rows(faces.starts, faces.corners, d.border_faces)[1])
+        starts, corners = take_rows(faces.starts, faces.corners, d.border_faces)
+        deepest = _largest_at(corners, starts, domain.sheets.heights_over(d.vertices[corners], starts), len(d.vertices))
+        placed = np.unique(corners)
         placed = placed[inner[placed]]
         off = domain.sheets.distance(d.vertices[placed])
         check.note(
             "surfaces inside",
-            np.maximum(off - 10 * slack, 0),
+            np.maximum(off - 10 * slack - SAGITTAS * deepest[placed], 0),
             lambda k: f"vertex {placed[k]} of a face on a surface inside is off it by {off[k]:.3g}",
         )
         inner[placed] = False
     if not d.layer.any():  # else inner vertices have made room for layers
         _check_nearest_of_solid(check, g, np.flatnonzero(inner[g.corners]), slack)
+
+
+def _largest_at(corners: np.ndarray, starts: np.ndarray, values: np.ndarray, n: int) -> np.ndarray:
+    """Return for `n` vertices the largest of the `values` (f,) of the faces with these `corners` (c,), at least 0."""
+    found = np.zeros(n)
+    np.maximum.at(found, corners, np.repeat(values, np.diff(starts)))
+    return found
 
 
 def _check_walls_of_solid(check: Check, slack: float) -> np.ndarray:
@@ -409,11 +418,10 @@ def _check_walls_of_solid(check: Check, slack: float) -> np.ndarray:
     corners = np.unique(faces.corners[wall:])
     # Faces towards cells that `subset` removed are not on the surface.
     on_surface = ~domain.removed_behind(-1 - faces.neighbor[faces.n_inner :])
-    counts = np.diff(faces.starts[faces.n_inner :])
-    held = np.unique(faces.corners[wall:][np.repeat(on_surface, counts)])
-    heights = domain.uncut.heights_over(d.vertices, faces.starts[faces.n_inner :] - wall, faces.corners[wall:])
-    deepest = np.zeros(len(d.vertices))
-    np.maximum.at(deepest, faces.corners[wall:], np.repeat(np.where(on_surface, heights, 0), counts))
+    starts = faces.starts[faces.n_inner :] - wall
+    held = np.unique(faces.corners[wall:][np.repeat(on_surface, np.diff(starts))])
+    heights = domain.uncut.heights_over(d.vertices, starts, faces.corners[wall:])
+    deepest = _largest_at(faces.corners[wall:], starts, np.where(on_surface, heights, 0), len(d.vertices))
     away = domain.uncut.boundary_distance(d.vertices[held])
     check.note(
         "walls",
