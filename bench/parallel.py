@@ -13,7 +13,9 @@ time that each make a mesh of n / p cells without messages: it has the cost of t
 cores and caches. `exchanges` and `reductions` are the rounds of messages
 between pairs of ranks, and of sums over all ranks, per step in which all ranks work. Some of both take place at the
 same time; `waits` counts how often a rank waits for others. `ghosts` is the number of ghosts of rank 0 in the last
-diagram over 2 d (n / p)^((d - 1) / d), an estimate of one layer of cells around a part. `one round` is the share of
+diagram over 2 d (n / p)^((d - 1) / d), an estimate of one layer of cells around a part. `over least` is the number of
+ghosts of all ranks over the least possible one: the neighbors of own cells, without which these are unknown, and in 2D
+the neighbors of these, as the cells of ghosts beside own ones must be known, too. `one round` is the share of
 diagrams whose cells were made once, since no ghosts were missing, and `asked` how often ranks asked each other for all
 ghosts anew, over the number of diagrams. `memory` is the largest device memory of a rank, in the run and while its
 cells are read, over that of the first number of ranks. Needs `pip install -e '.[mpi]'`.
@@ -55,10 +57,25 @@ COLUMNS = {
     "reductions": shown("reductions", ".0f"),
     "waits": shown("waits", ".0f"),
     "ghosts": shown("ghosts", ".2f"),
+    "over least": shown("over_least", ".2f"),
     "one round": shown("one_round", ".0%"),
     "asked": shown("asked", ".0%"),
     "memory": shown("memory", ".3f"),
 }
+
+
+def least_ghosts(whole: clvoro.Result, labels: list[np.ndarray], layers: int) -> int:
+    """Return how many cells of the `whole` mesh are within `layers` of the parts with these `labels`, part by part."""
+    starts, found = whole.diagram.neighbor_starts, 0
+    owner, other = np.repeat(np.arange(len(whole)), np.diff(starts)), whole.diagram.neighbors
+    owner, other, every = owner[other >= 0], other[other >= 0], np.sort(np.concatenate(labels))
+    for own in labels:
+        known = np.zeros(len(whole), bool)
+        known[np.searchsorted(every, own)] = True
+        for _ in range(layers):
+            known[other[known[owner]]] = True
+        found += np.count_nonzero(known) - len(own)
+    return found
 
 
 def measure_rank(options: argparse.Namespace) -> None:
@@ -103,10 +120,10 @@ def measure_rank(options: argparse.Namespace) -> None:
         calls.append((peers.count == comm.size, of.steps, peers.exchanges, peers.reductions, peers.waits))
 
     Run._add_row = counted
-    whole = adapter.run(domain, cells ** (-1 / dim), points=x, method="lloyd", max_steps=0).gather()
+    found = adapter.run(domain, cells ** (-1 / dim), points=x, method="lloyd", max_steps=0).gather()
     digest = hashlib.sha256()
-    for name in ("neighbors", "volumes", "centroids", "face_measures") if whole is not None else ():
-        digest.update(np.ascontiguousarray(getattr(whole, name)))
+    for name in ("neighbors", "volumes", "centroids", "face_measures") if found is not None else ():
+        digest.update(np.ascontiguousarray(getattr(found, name)))
     factor = {2: 2 / 3, 3: (13 / 27) ** 0.5}[dim]
     h = factor * (domain.measure / cells) ** (1 / dim)
 
@@ -125,7 +142,7 @@ def measure_rank(options: argparse.Namespace) -> None:
     rounds.clear()
     calls.clear()
     asked[0] = 0
-    del whole, single
+    del found, single
     gc.collect()
     memory_limits.MOST_TAKEN.clear()
     mesh, spent, waits = run(adapter, h)
@@ -133,6 +150,8 @@ def measure_rank(options: argparse.Namespace) -> None:
     _ = [getattr(mesh.diagram, name) for name in clvoro.Diagram._NAMES if name in dir(mesh.diagram)]
     reading = comm.allreduce(time.process_time() - began)
     taken = comm.allreduce(max(memory_limits.MOST_TAKEN.values()), MPI.MAX)
+    of_rank_0, of_all = ghosts[0], comm.allreduce(ghosts[0])
+    whole, labels = mesh.gather(), comm.gather(mesh.parts.labels if mesh.parts else np.arange(len(mesh)))
     steps = int(mesh.history["step"][-1])
     per_part = mesh.history["cells"][-1] / comm.size
     layer = 2 * dim * per_part ** ((dim - 1) / dim)
@@ -152,9 +171,10 @@ def measure_rank(options: argparse.Namespace) -> None:
             "exchanges": exchanges / done,
             "reductions": reductions / done,
             "waits": halts / done,
-            "ghosts": ghosts[0] / layer,
+            "ghosts": of_rank_0 / layer,
+            "over_least": float(of_all / max(least_ghosts(whole, labels, 4 - dim), 1)),
             "one_round": float(np.mean(np.array(rounds) == 1)) if comm.size > 1 else 1.0,
-            "taken": taken,
+            "taken": float(taken),
             "asked": asked[0] / len(rounds) if comm.size > 1 else 0.0,
         }
         print(json.dumps(figures))
