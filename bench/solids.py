@@ -276,8 +276,6 @@ LAYER_COLUMNS = {
     "checkMesh": lambda r: "Mesh OK" if r["plain"] else r["why"],
     "with -allGeometry": PLANE_COLUMNS["checkMesh"],
 }
-_FULL = 0.9
-"""Layers count as full from this share of their thickness on."""
 
 
 def measure_layers(adapter: clvoro.Adapter, options: argparse.Namespace, report: Report) -> str:
@@ -312,26 +310,17 @@ def measure_layers(adapter: clvoro.Adapter, options: argparse.Namespace, report:
 
 
 def reached(result: clvoro.Result, layers: clvoro.Layers) -> dict[str, float]:
-    """Return how thick layers are, by the distances of their vertices from the surface."""
+    """Return how thick layers are, as the run says it, and the heights of first prisms, their volumes over areas."""
     d, f = result.diagram, result.diagram.faces
-    k = f.n_inner
-    one, other, count = d.layer[f.owner[:k]], d.layer[f.neighbor[:k]], layers.count
-
-    def away(faces: np.ndarray) -> np.ndarray:
-        corners = [f.corners[f.starts[i] : f.starts[i + 1]] for i in np.flatnonzero(faces).tolist()]
-        return d.domain.boundary_distance(f.points[np.unique(np.concatenate([*corners, np.zeros(0, int)]))])
-
-    thick = away((one == 0) & (other == count)) / layers.thickness
-    first = (away(np.minimum(one, other) == 1) if count > 1 else thick * layers.thickness) / layers.height
-    # Each of these vertices has one on the wall above; other walls count as layers of no thickness.
-    bare = len(np.unique(f.corners[f.starts[k] :])) - len(thick)
-    thick = np.concatenate([thick, np.zeros(max(bare, 0))])
+    walls = f.n_inner + np.flatnonzero(d.layer[f.owner[f.n_inner :]] == 1)
+    first = d.volumes[f.owner[walls]] / f.area[walls] / layers.height
+    (told,) = result.settings["thickness"]
     return {
         "prisms": int((d.layer > 0).sum()),
         "inner": float(np.abs(result.size_error[d.layer == 0]).mean()),
-        "thickness": float(thick.mean()),
-        "full": float((thick > _FULL).mean()),
-        "first": float(first[first > _FULL].mean()) if (first > _FULL).any() else float("nan"),
+        "thickness": told["mean"] / told["asked"],
+        "full": told["full_share"],
+        "first": float(np.median(first)) if len(first) else float("nan"),
         "aspect": float(f.measures.aspect_ratio.max()),
     }
 

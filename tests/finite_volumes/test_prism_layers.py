@@ -131,6 +131,11 @@ def test_curved_walls_keep_the_thickness(adapter):
     assert np.abs(mesh.size_error[mesh.layer == 0]).mean() < 0.03
 
 
+def test_layers_on_a_ball_are_full_though_wall_polygons_have_short_sides(adapter):
+    mesh = adapter.run(Solid.ball((0, 0, 0), 0.6, edge=0.1), 0.15, effort="fast", layers=Layers(0.015, 4))
+    assert mesh.summary()["thickness"][0]["full_share"] > 0.99  # 0.80 where the ends of a side move as they like
+
+
 def test_a_mesh_with_layers_is_a_start(adapter, cube):
     again = adapter.run(
         cube.domain, 0.25, points=cube.points[::-1], layers=Layers(0.02, 3, 1.3, edges=["xMin", "zMax"])

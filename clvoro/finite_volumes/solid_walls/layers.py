@@ -31,6 +31,8 @@ _LONGEST = 2.2
 """Longest way of a vertex over the thickness: three walls at right angles need 1.73."""
 _SAME = 0.15
 """Patches at a vertex count as parallel if the tangent of half the angle between their normals is less than this."""
+_SHORTENED, _EVENED = 0.5, 20
+"""Share of its length that a side of a wall polygon may lose, and how often the ways at shorter ones are evened out."""
 _SLOPE = 0.6
 """Largest change of the thickness along a wall, over the distance."""
 _SWEEPS = 100
@@ -198,6 +200,27 @@ class _LayeredWalls:
         self.beyond[sides], self.begin, self.end = sides[:, ::-1], begin, end
         alone = np.flatnonzero(self.beyond == np.arange(len(begin)))
         self.way[np.concatenate([begin[alone], end[alone]])] = 0
+        self._keep_short_sides()
+
+    def _keep_short_sides(self) -> None:
+        """Make the ways at both ends of a side within a patch alike, so that none loses more than half of its length.
+
+        The normals of a curved wall at its vertices are those of the polygons there, and as rough as these.
+        """
+        x, smooth = self.faces.points[self.vertices], self.way.any(axis=1) & (self.n_patches == 1)
+        sides = np.flatnonzero(smooth[self.begin] & smooth[self.end])
+        a, b = self.begin[sides], self.end[sides]
+        side = x[b] - x[a]
+        for _ in range(_EVENED):
+            change = ((self.way[b] - self.way[a]) * side).sum(axis=1)
+            short = change < -_SHORTENED * (side * side).sum(axis=1)
+            rows = np.concatenate([a[short], b[short]])
+            total, count = self.way.copy(), np.ones(len(x))
+            np.add.at(total, rows, self.way[np.concatenate([b[short], a[short]])])
+            np.add.at(count, rows, 1)
+            if not len(rows):
+                return
+            self.way = total / count[:, None]
 
     def _onto_patches(self, rows: np.ndarray, places: np.ndarray, bare: bool = False) -> np.ndarray:
         """Return `places` (k, 3) of the vertices `rows` (k,), as far from their patches as the vertices are.
