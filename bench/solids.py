@@ -1,11 +1,6 @@
 """Meshes of solids, and what OpenFOAM says: `checkMesh -allGeometry -allTopology` for CAD-like parts.
 
-    python bench/solids.py [--only NAMES] [--runs NAMES] [--seeds N] [--worst] [--resolutions NUMBERS]
-                           [--graded] [--booleans N]
-                           [--files FOLDER] [--first N] [--cells N] [--limit SECONDS] [--speed NUMBERS]
-                           [--domains NAMES] [--order SIZES]
-                           [--layers THICKNESS:COUNT:GROWTH,...] [--surfaces] [--keep FOLDER]
-                           [--pictures FOLDER] [--device NAME] [--dtype float32] [--json]
+    python bench/solids.py [OPTIONS]
 
 The solids are in `bench/_solid_shapes.py`; they need trimesh, manifold3d, shapely, networkx and, for the gyroid,
 scikit-image. Each is meshed at two uniform sizes with default settings, and written as polyMesh. A row has the number
@@ -84,8 +79,7 @@ COLUMNS = {
 GOALS = {"non_orthogonality": 20, "mean_non_orthogonality": 3, "skewness": 2, "concave": 0}
 """Largest figures of a mesh that is as wanted."""
 WORST_COLUMNS = {
-    **{name: COLUMNS[name] for name in ("solid", "h", "cells", "s", "mean e", "non-orth. max, mean", "skewness")},
-    "concave": COLUMNS["concave"],
+    **{name: show for name, show in COLUMNS.items() if name not in ("run", "quotient", "volume", "checkMesh")},
     "accepted": lambda r: f"{r['accepted']} of {r['runs']}",
     "within goals": lambda r: r["good"],
 }
@@ -228,7 +222,7 @@ def _serve(jobs: Any, options: argparse.Namespace) -> None:
         jobs.send(measure_boolean(adapter, job, options.cells))
 
 
-def measure_booleans(options: argparse.Namespace, report: Report) -> str:
+def measure_booleans(_: clvoro.Adapter, options: argparse.Namespace, report: Report) -> str:
     """Add a row for each random solid or file, and return how many have each verdict."""
     context, worker, pipe = multiprocessing.get_context("spawn"), None, None
     jobs: dict[Any, Any] = {
@@ -499,15 +493,14 @@ def main() -> None:
         return report.finish(heading(adapter, "processor time of runs, and of meshes that are read with their faces"))
     require("checkMesh")
     adapter = make_adapter(options)
-    if options.booleans or options.files:
-        report = Report(options.json, BOOLEAN_COLUMNS)
-        return report.finish(heading(adapter, measure_booleans(options, report)))
-    if options.surfaces:
-        report = Report(options.json, SURFACE_COLUMNS)
-        return report.finish(heading(adapter, measure_surfaces(adapter, options, report)))
-    if options.layers:
-        report = Report(options.json, LAYER_COLUMNS)
-        return report.finish(heading(adapter, measure_layers(adapter, options, report)))
+    for chosen, columns, measured in (
+        (options.booleans or options.files, BOOLEAN_COLUMNS, measure_booleans),
+        (options.surfaces, SURFACE_COLUMNS, measure_surfaces),
+        (options.layers, LAYER_COLUMNS, measure_layers),
+    ):
+        if chosen:
+            report = Report(options.json, columns)
+            return report.finish(heading(adapter, measured(adapter, options, report)))
     report = Report(options.json, WORST_COLUMNS if options.worst else COLUMNS)
     every = product(
         names(options.only) or SHAPES, names(options.resolutions), names(options.runs), range(options.seeds)

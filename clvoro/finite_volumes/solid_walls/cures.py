@@ -217,7 +217,11 @@ class Cures:
 
     def _judged(self, edits: Edits, trials: list[Edits]) -> list[Option]:
         """Return what those trials gain that leave cells closed."""
-        trials = [t for t in trials if all(t.is_sound(c) and not t.is_vast(c) for c in t.touched)]
+        trials = [
+            t
+            for t in trials
+            if not any(map(t.is_vast, t.touched)) and (t.shape() is not t or all(map(t.is_sound, t.touched)))
+        ]
         if not trials:
             return []
         around = edits.alive(set().union(*(t.touched for t in trials)))
@@ -335,17 +339,14 @@ class Cures:
             groups |= {frozenset(e) for e, far in zip(edges_of(loop), length.tolist(), strict=True) if far < short}
             if np.linalg.norm(x - x.mean(axis=0), axis=1).max() < short:
                 groups.add(frozenset(loop))
-        for group in sorted(groups, key=sorted):
-            vertices = sorted(group)
-            walls = [edits.patches_at(cell, v) for v in vertices]
-            every = set().union(*walls)
-            x = edits.positions(vertices)
-            held = [k for k, w in enumerate(walls) if w == every]
-            targets = [x[k] for k in held] if every else [x.mean(axis=0)]
-            if not held:
-                place = self._placed(every, x.mean(axis=0), h)
-                targets = [] if place is None else [place]
-            for target in targets[:3]:
+        ordered = [sorted(group) for group in sorted(groups, key=sorted)]
+        walls = [[edits.patches_at(cell, v) for v in vertices] for vertices in ordered]
+        every = [set[int]().union(*w) for w in walls]
+        x = [edits.positions(vertices) for vertices in ordered]
+        fits, places = self._all_placed(every, np.array([y.mean(axis=0) for y in x]).reshape(-1, 3), h)
+        for k, vertices in enumerate(ordered):
+            held = x[k][[bool(w) and w == every[k] for w in walls[k]]]
+            for target in held[:3] if len(held) else places[k : k + 1] if fits[k] else ():
                 trial = edits.trial()
                 _collapse(trial, cell, vertices, target)
                 yield trial
