@@ -143,9 +143,12 @@ class Multigrid:
         The cycle stays positive definite with any coarse correction. That of a slightly different graph is nearly as
         good: aggregates stay together, and weights between them change less than those between cells.
 
-        - `starts`, `columns`, `weights`, `ghosts`: as for `set_up`, which has been called for as many cells.
+        - `starts`, `columns`, `weights`, `ghosts`: as for `set_up`, which has been called for as many cells. With other
+          ghosts all is set up again.
         """
-        if not self._levels:  # all are gathered
+        if (
+            not self._levels or ghosts is not self._levels[0].graph.ghosts
+        ):  # all are gathered, or aggregates lack ghosts
             self.set_up(starts, columns, weights, ghosts)
             return
         graph = Graph(starts, columns, weights, ghosts)

@@ -235,6 +235,10 @@ def test_the_poisson_equation_in_two_halves(ctx, dim, real, from_zero, gathered,
             if gathered and part.peers:
                 most = 5 + 2 * (len(levels) - 1) if levels else 2
                 assert engine.peers.exchanges - before <= most * (solution.iterations + 1)
+                cycles = poisson.set_up_multigrid(matrix)
+                kept = [level.aggregates for level in cycles._levels]
+                cycles.update_finest(*matrix.rows, replace(part.ghosts))
+                assert all(level.aggregates is not old for level, old in zip(cycles._levels, kept, strict=True))
             return phi.get(), solution.iterations
 
     (whole, count), two = halves.run(work)
