@@ -48,6 +48,8 @@ _OFF_CENTER = 0.15
 """Least distance over h from which the generators of cells with oblique faces are moved to the centroids."""
 _CENTERINGS = 6
 """How often generators are moved there."""
+_LAST_MOVES, _FEW_LEFT = 4, 12
+"""How often generators move where faces are still oblique after cures, and for how many generators."""
 _MANY, _SHARE = 250, 0.05
 """So many rejected cells, and such a share of those at walls, are more than cures can mend in a time like the run's:
 they stay as they are."""
@@ -102,6 +104,15 @@ class _Made:
         excess[(pairs < 0).any(axis=0)] = 0
         oblique = at_generators(pairs.ravel(), len(self.near.points), np.tile(excess, 2))
         return REJECTED * self.count_rejected() + oblique
+
+    def weigh_left(self) -> np.ndarray:
+        """Return the same, where faces are more oblique or skewed than wanted; see `oblique_cells`."""
+        over, found = over_wanted(self.faces.measures), self.oblique_cells()
+        worst = np.zeros(self.faces.n_cells)
+        for cells in (self.faces.owner, self.faces.neighbor):
+            np.maximum.at(worst, cells[cells >= 0], over[cells >= 0])
+        numbers, n = self.near.numbers[self.home], len(self.near.points)
+        return REJECTED * self.count_rejected() + at_generators(numbers[found], n, worst[found] - 0.9)
 
     def oblique_cells(self) -> np.ndarray:
         """Return the cells of faces that are more oblique or skewed than wanted, (k,) int."""
@@ -248,6 +259,18 @@ def solid_diagram(
         trial[rows[far], :3] = x[far]
         return trial
 
+    def straightened(made: _Made) -> _Made:
+        oblique, near = made.oblique_cells(), made.near
+        if not len(oblique):
+            return made
+        names, h = near.numbers[made.home], near.sizes[made.home]
+        faces, origin, own, rejected, _ = cured(surface, made.faces, names, made.own, h, made.rejected, oblique=oblique)
+        return replace(made, faces=faces, home=made.home[origin], own=own, rejected=rejected)
+
+    def remake_straight(state: np.ndarray, last: _Made | None) -> _Made | None:
+        made = remake(state, last)
+        return None if made is None else straightened(made)
+
     latest: list[_Made] = []
     goes_on = [True] * _SIMPLER + MOVES * [False, *[True] * _SIMPLER_AFTER]
     state = np.column_stack([points, np.full(len(points), EXACT)])
@@ -261,10 +284,13 @@ def solid_diagram(
     trials = [True] * _CENTERINGS if straight and not spared else []
     centered = least_bad(mesh, state, sizes, _Made.weigh_oblique, center, remake, trials)
     mesh = min(centered, mesh, key=lambda made: len(made.rejected))
-    if straight and not spared and len(oblique := mesh.oblique_cells()):
-        names, h = mesh.near.numbers[mesh.home], mesh.near.sizes[mesh.home]
-        faces, origin, own, rejected, _ = cured(surface, mesh.faces, names, mesh.own, h, mesh.rejected, oblique=oblique)
-        mesh = replace(mesh, faces=faces, home=mesh.home[origin], own=own, rejected=rejected)
+    if straight and not spared:
+        mesh = straightened(mesh)
+        if 0 < np.count_nonzero(mesh.weigh_left()) <= _FEW_LEFT:
+            state[:, :3], state[:, 3] = mesh.near.points, EXACT
+            state[mesh.near.rows, 3] = mesh.walls[:-1]
+            goes_on = [False] * _LAST_MOVES
+            mesh = least_bad(mesh, state, sizes, _Made.weigh_left, change, remake_straight, goes_on)
     tell("cells without walls")
     faces, home = mesh.near.put_back(mesh.faces, mesh.home, mesh.own)
     if warns:
