@@ -124,31 +124,6 @@ class Edits:
             self._known_faces[k] = int(m.owner[k]), int(m.neighbor[k]), loop
         return self._known_faces[k]
 
-    def has_changed(self, cell: int) -> bool:
-        """Return whether a cell has other faces than in the mesh."""
-        at: Edits | None = self
-        while at is not None:
-            if cell in at._cells:
-                return True
-            at = at.parent
-        return False
-
-    def unchanged_faces(self, number: dict[int, int], changed: list[int]) -> tuple[np.ndarray, ...]:
-        """Return owner, neighbor, number of corners and corners of the faces that no cell of `changed` has.
-
-        - `number`: cells and their new numbers; others are walls. The owner has the smaller one.
-        """
-        m, keys = self.mesh, np.array([*number], np.int64)
-        faces = np.unique(take_rows(self._of_cell, self._face_of, keys[~np.isin(keys, changed)])[1])
-        ends = np.stack([m.owner[faces], m.neighbor[faces]])
-        faces, ends = (x[..., ~np.isin(ends, changed).any(axis=0)] for x in (faces, ends))
-        order = np.argsort(keys)
-        place = order[np.minimum(np.searchsorted(keys, ends, sorter=order), len(keys) - 1)]
-        a, b = np.where(keys[place] == ends, place, -1)
-        turned = (a < 0) | ((b >= 0) & (b < a))
-        starts, loops = take_rows(m.starts, m.corners, faces, turned)
-        return np.where(turned, b, a), np.where(turned, a, b), np.diff(starts), loops
-
     def is_vast(self, cell: int) -> bool:
         """Return whether a cell stands for all that are far from walls."""
         return len(self.faces_of(cell)) > _MOST_FACES
@@ -508,15 +483,14 @@ class _Region(NamedTuple):
 
 
 def _region(edits: Edits, cells: tuple[int, ...]) -> _Region:
-    """Return some cells with their neighbors. Most of these, and the faces between them, are as in the mesh."""
+    """Return some cells with their neighbors."""
     number = {c: k for k, c in enumerate(cells)}
     for c in cells:
         for n in edits.neighbors(c):
             if not edits.is_vast(n):
                 number.setdefault(n, len(number))
-    mine = [c for c in number if edits.has_changed(c)]
     owner, neighbor, counts, corners = list[int](), list[int](), list[int](), list[int]()
-    for k in set().union(*(edits.faces_of(c) for c in mine)):
+    for k in set().union(*(edits.faces_of(c) for c in number)):
         i, j, loop = edits.face(k)
         if i not in number:
             i, j, loop = j, -1, loop[::-1]
@@ -527,10 +501,8 @@ def _region(edits: Edits, cells: tuple[int, ...]) -> _Region:
         neighbor.append(b)
         counts.append(len(loop))
         corners += loop
-    one, other, lengths, loops = edits.unchanged_faces(number, mine)
-    vertices, rows = np.unique(np.append(np.array(corners, np.int64), loops), return_inverse=True)
-    lists = (np.append(np.array(x, np.int64), y) for x, y in ((owner, one), (neighbor, other), (counts, lengths)))
-    return _Region(*lists, rows, vertices.tolist(), len(number))
+    vertices, rows = np.unique(np.array(corners, np.int64), return_inverse=True)
+    return _Region(*(np.array(x, np.int64) for x in (owner, neighbor, counts)), rows, vertices.tolist(), len(number))
 
 
 def over_wanted(measures: SolverMeasures) -> np.ndarray:
