@@ -48,7 +48,7 @@ _OFF_CENTER = 0.15
 """Least distance over h from which the generators of cells with oblique faces are moved to the centroids."""
 _CENTERINGS = 6
 """How often generators are moved there."""
-_LAST_MOVES, _FEW_LEFT = 4, 12
+_LAST_MOVES, _FEW_LEFT = 2, 12
 """How often generators move where faces are still oblique after cures, and for how many generators."""
 _MANY, _SHARE = 250, 0.05
 """So many rejected cells, and such a share of those at walls, are more than cures can mend in a time like the run's:
