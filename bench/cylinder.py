@@ -14,7 +14,7 @@ Strouhal number. Fluxes are projected onto each new mesh: "divergence" is the la
 afterwards, over the largest flux.
 
 Lift is small, and random errors of the cells above and below the cylinder do not cancel. "Mirrored" is a mesh of the
-channel below the axis of the cylinder, with the mirror images of its generators above it, or of its cells with Gmsh.
+channel below the axis of the cylinder, with the mirror images of its generators above it.
 
 "Uniform" is a mesh of one size. "Newcomer" is a polygon of 360 edges with sizes that grow from it, and no layers.
 "Followed" begins as that mesh, with as many cells as the row says, and follows the solution: `clvoro.foam.adapt_case`
@@ -224,7 +224,7 @@ def _with_mirror_images(points: np.ndarray) -> np.ndarray:
     return np.concatenate([points, np.column_stack([x, CENTER[1] + up])])
 
 
-def mesh_gmsh(quadrangles: bool, mirrored: bool = False) -> Callable[..., None]:
+def mesh_gmsh(quadrangles: bool) -> Callable[..., None]:
     def mesh(case: Case, _: clvoro.Adapter, size: Size, n_cells: int, seed: int) -> None:
         try:
             import gmsh
@@ -233,9 +233,7 @@ def mesh_gmsh(quadrangles: bool, mirrored: bool = False) -> Callable[..., None]:
         # An equilateral triangle of area h^2 has edges of 1.52 h.
         factor, field = (1.0 if quadrangles else 1.52), scaled(size, n_cells)
         for _ in range(4):
-            points, cells = _gmsh(gmsh, field, factor, quadrangles, CENTER[1] if mirrored else HEIGHT)
-            if mirrored:
-                points, cells = _with_mirrored_cells(points, cells)
+            points, cells = _gmsh(gmsh, field, factor, quadrangles)
             if abs(len(cells) / n_cells - 1) < 0.01:
                 break
             factor *= math.sqrt(len(cells) / n_cells)
@@ -244,10 +242,8 @@ def mesh_gmsh(quadrangles: bool, mirrored: bool = False) -> Callable[..., None]:
     return mesh
 
 
-def _gmsh(
-    gmsh: Any, field: Size, factor: float, quadrangles: bool, height: float
-) -> tuple[np.ndarray, list[np.ndarray]]:
-    """Return the points and cells of a mesh of the channel up to `height`, with edges `factor` times `field`."""
+def _gmsh(gmsh: Any, field: Size, factor: float, quadrangles: bool) -> tuple[np.ndarray, list[np.ndarray]]:
+    """Return the points and cells of a mesh of the channel, with edges `factor` times `field`."""
     gmsh.initialize(interruptible=False)
     try:
         options = {
@@ -262,7 +258,7 @@ def _gmsh(
         for name, value in options.items():
             gmsh.option.setNumber(name, value)
         gmsh.model.add("channel")
-        channel = gmsh.model.occ.addRectangle(0, 0, 0, LENGTH, height)
+        channel = gmsh.model.occ.addRectangle(0, 0, 0, LENGTH, HEIGHT)
         disk = gmsh.model.occ.addDisk(*CENTER, 0, RADIUS, RADIUS)
         gmsh.model.occ.cut([(2, channel)], [(2, disk)])
         gmsh.model.occ.synchronize()
@@ -283,15 +279,6 @@ def _gmsh(
             cells.append(cell if area > 0 else cell[::-1])
     used = np.unique(np.concatenate(cells))
     return points[used], [np.searchsorted(used, cell) for cell in cells]
-
-
-def _with_mirrored_cells(points: np.ndarray, cells: list[np.ndarray]) -> tuple[np.ndarray, list[np.ndarray]]:
-    """Return a mesh of the lower part with its image above the axis, as `_with_mirror_images` places it."""
-    off = points[:, 1] < CENTER[1] - 1e-9
-    image = np.arange(len(points))
-    image[off] = len(points) + np.arange(off.sum())
-    up = _with_mirror_images(points[off])[off.sum() :]
-    return np.concatenate([points, up]), cells + [image[cell[::-1]] for cell in cells]
 
 
 def _patch_of(middles: np.ndarray) -> np.ndarray:
@@ -353,9 +340,7 @@ MESHERS: dict[str, Callable[..., None]] = {
     "clvoro, layers": mesh_clvoro(True, "best"),
     "clvoro, layers, mirrored": mesh_clvoro(True, "best", mirrored=True),
     "Gmsh triangles": mesh_gmsh(False),
-    "Gmsh triangles, mirrored": mesh_gmsh(False, mirrored=True),
     "Gmsh quadrangles": mesh_gmsh(True),
-    "Gmsh quadrangles, mirrored": mesh_gmsh(True, mirrored=True),
     "blockMesh": mesh_blocks,
     "uniform": mesh_newcomer(True),
     "newcomer": mesh_newcomer(False),
