@@ -128,7 +128,7 @@ def run_ranks(ranks: int, script: Sequence[str], **settings: Any) -> subprocess.
     """Run a `script` (file, arguments) under `mpiexec`, a core for each rank, with `settings` of `subprocess.run`."""
     mpiexec = shutil.which("mpiexec", path=Path(sys.executable).parent) or "mpiexec"
     command = [mpiexec, "-n", str(ranks), sys.executable, "-W", "ignore", *script]
-    environment = {**os.environ, "POCL_MAX_PTHREAD_COUNT": "1"}
+    environment = {**os.environ, "POCL_MAX_PTHREAD_COUNT": "1", "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
     return subprocess.run(command, env=environment, stdout=subprocess.PIPE, text=True, **settings)
 
 
