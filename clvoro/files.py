@@ -1,4 +1,4 @@
-"""Open files that a caller names: only regular ones. Pipes may block, devices may be endless. Arrays as text."""
+"""Open the files that a caller names, if they are regular: pipes may block, devices may have no end. Arrays as text."""
 
 from __future__ import annotations
 

@@ -153,12 +153,19 @@ def _balanced(diagram: Diagram, sheets: Sheets, rejected: np.ndarray) -> tuple[D
     faces, every = balanced(mesh, patch, bent, sheets.nearest, turned), np.ones(len(diagram), bool)
     if faces is mesh:
         return diagram, rejected
-    made = diagram_of(faces)
+    made = _with_borders(faces, rows)
+    found = _rejected(made, every)
+    if len(worse := np.setdiff1d(found, rejected)):
+        made = _with_borders(unbalanced(faces, mesh.points, worse)[0], rows)
+        found = _rejected(made, every)
+    return made, found
+
+
+def _with_borders(mesh: Faces, rows: np.ndarray) -> Diagram:
+    """Return the diagram of a mesh whose faces `rows` (k,) lie on surfaces."""
+    made = diagram_of(mesh)
     made.border_faces = rows
-    if len(worse := np.setdiff1d(_rejected(made, every), rejected)):
-        made = diagram_of(unbalanced(faces, mesh.points, worse)[0])
-        made.border_faces = rows
-    return made, _rejected(made, every)
+    return made
 
 
 def _rejected(diagram: Diagram, among: np.ndarray) -> np.ndarray:
@@ -190,9 +197,7 @@ def _moved(mesh: Faces, sheets: Sheets, h: np.ndarray) -> Diagram:
     vertices, size = _vertices(mesh, rows, np.minimum(h[mesh.owner[rows]], h[mesh.neighbor[rows]]))
     points = mesh.points.copy()
     points[vertices] = _onto(mesh, sheets, vertices, size)
-    made = diagram_of(replace(mesh, points=points, diagram=None))
-    made.border_faces = rows
-    return made
+    return _with_borders(replace(mesh, points=points, diagram=None), rows)
 
 
 def _beside(diagram: Diagram) -> np.ndarray:

@@ -46,12 +46,12 @@ class Grid:
         return math.prod(self.counts.tolist())
 
     def nodes(self, rows: np.ndarray) -> np.ndarray:
-        """Return the places of nodes (k,) int, (k, d)."""
+        """Return the positions (k, d) of the nodes with the numbers (k,)."""
         places = np.unravel_index(rows, self.counts, order="F")
         return np.column_stack([axis[i] for axis, i in zip(self.axes, places, strict=True)])
 
     def around(self, marks: np.ndarray) -> Iterator[np.ndarray]:
-        """Yield the nodes at one corner after the other of the boxes of nodes around `marks` (k, d), (k,) int each."""
+        """Yield, for one corner after the other, the nodes (k,) int there of the boxes around `marks` (k, d)."""
         first = [
             np.clip(np.searchsorted(axis, x, side="right") - 1, 0, len(axis) - 2)
             for axis, x in zip(self.axes, marks.T, strict=True)

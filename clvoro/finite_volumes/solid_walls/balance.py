@@ -21,7 +21,7 @@ _INNER = 0.01
 """A vertex stays in the planes of the faces between cells, and moves off its walls by their depths. Where it cannot do
 both, the planes count this much, the depths 1. It never leaves flat patches."""
 _LONGEST = 2.0
-"""Longest way of a vertex, over the largest depth of the wall polygons around it."""
+"""Farthest that a vertex moves, over the largest depth of the polygons around it."""
 
 
 def balanced(faces: Faces, patch: np.ndarray, bent: np.ndarray, feet: Feet, turned: np.ndarray | None = None) -> Faces:

@@ -68,7 +68,7 @@ class Edits:
         return Edits(self.mesh, self)
 
     def shape(self) -> Edits:
-        """Return these edits without trials on top that only move vertices."""
+        """Return the latest edits that changed faces: those after them only moved vertices."""
         at = self
         while at.parent is not None and not at._faces:
             at = at.parent

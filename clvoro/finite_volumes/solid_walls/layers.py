@@ -32,7 +32,7 @@ _LONGEST = 2.2
 _SAME = 0.15
 """Patches at a vertex count as parallel if the tangent of half the angle between their normals is less than this."""
 _SHORTENED, _EVENED = 0.5, 20
-"""Share of its length that a side of a wall polygon may lose, and how often the ways at shorter ones are evened out."""
+"""Largest share of its length that a side of a wall polygon may lose; most passes that average how its ends move."""
 _SLOPE = 0.6
 """Largest change of the thickness along a wall, over the distance."""
 _SWEEPS = 100
@@ -203,7 +203,7 @@ class _LayeredWalls:
         self._keep_short_sides()
 
     def _keep_short_sides(self) -> None:
-        """Make the ways at both ends of a side within a patch alike, so that none loses more than half of its length.
+        """Make both ends of a side move alike, so that no side within a patch loses more than half of its length.
 
         The normals of a curved wall at its vertices are those of the polygons there, and as rough as these.
         """

@@ -204,93 +204,7 @@ def solid_diagram(
     With `warns` it warns with `MismatchWarning` if generators have no cell, cells are cut, leave out creases, or are
     concave. It says how many, and the first place.
     """
-
-    def remake(state: np.ndarray, last: _Made | None) -> _Made | None:
-        points, near = state[:, :3], None if last is None else last.near
-        if last is not None and last.cures is not None and last.cures.are_spent:
-            return None
-        if near is None or not np.array_equal(near.points, points):
-            near = NearWalls.of(surface, points, sizes, whole(points))
-        try:
-            tell(f"walls of {len(near.rows)} cells")
-            raw = _Maker(surface, near, np.append(state[near.rows, 3], EXACT)).mesh()
-            _check_lost(surface, near, raw.home)
-        except InputError:  # a simpler cell of a thin part may be nothing
-            if last is None:
-                raise
-            return None
-        made = _finished(surface, raw, None if last is None else last.cures, tell, straight and last is None)
-        latest[:] = [made]
-        return made
-
-    def change(state: np.ndarray, rows: np.ndarray, number: int) -> np.ndarray:
-        trial = state.copy()
-        if not goes_on[number]:
-            if len(rows) > FEW * len(state):
-                return state
-            move = goes_on[:number].count(False)
-            trial[:, :3] = moved(surface.solid, depth, sizes, state[:, :3], rows, move, held)
-            trial[rows, 3] = EXACT
-            if surface.widths.min() < SNAP_CREASE * sizes.max(initial=0.0):
-                # Generators around narrow facets stay, unless OpenFOAM rejects their own cells.
-                beside = np.setdiff1d(np.flatnonzero((trial[:, :3] != state[:, :3]).any(axis=1)), rows)
-                edge = surface.nearest_crease(state[beside, :3], _AROUND * sizes[beside])[0]
-                beside = beside[edge >= 0][surface.solid.creases.concave[edge[edge >= 0]]]
-                trial[beside, :3] = state[beside, :3]
-            return trial
-        creased = rows[surface.nearest_crease(state[rows, :3], _CREASED * sizes[rows])[0] >= 0]
-        rounded = creased[state[creased, 3] == ROUNDED]
-        beside = scipy.spatial.KDTree(points).query_ball_point(points[rounded], _BESIDE * sizes[rounded])
-        creased = np.array(sorted({*creased.tolist()}.union(*beside)), np.int64)
-        trial[creased, 3] = np.minimum(state[creased, 3] + 1, ROUNDED)
-        return trial
-
-    def depth(x: np.ndarray) -> np.ndarray:
-        return -surface.closest(x)[2]
-
-    def center(state: np.ndarray, rows: np.ndarray, number: int) -> np.ndarray:
-        del number
-        made, trial = latest[0], state.copy()
-        home = np.where(made.own, made.near.numbers[made.home], -1)
-        cells = np.flatnonzero(np.isin(home, rows[rows >= held]))
-        rows, x = home[cells], made.faces.measures.geometry.centroids[cells]
-        far = np.linalg.norm(x - state[rows, :3], axis=1) > _OFF_CENTER * sizes[rows]
-        far[far] = depth(x[far]) > 0
-        trial[rows[far], :3] = x[far]
-        return trial
-
-    def straightened(made: _Made) -> _Made:
-        oblique, near = made.oblique_cells(), made.near
-        if not len(oblique):
-            return made
-        names, h = near.numbers[made.home], near.sizes[made.home]
-        faces, origin, own, rejected, _ = cured(surface, made.faces, names, made.own, h, made.rejected, oblique=oblique)
-        return replace(made, faces=faces, home=made.home[origin], own=own, rejected=rejected)
-
-    def remake_straight(state: np.ndarray, last: _Made | None) -> _Made | None:
-        made = remake(state, last)
-        return None if made is None else straightened(made)
-
-    latest: list[_Made] = []
-    goes_on = [True] * _SIMPLER + MOVES * [False, *[True] * _SIMPLER_AFTER]
-    state = np.column_stack([points, np.full(len(points), EXACT)])
-    first = remake(state, None)
-    assert first is not None
-    spared = straight and _are_many(first.near, first.rejected)
-    mesh = first if spared else least_bad(first, state, sizes, _Made.count_rejected, change, remake, goes_on)
-    state[:, :3], state[:, 3] = mesh.near.points, EXACT
-    state[mesh.near.rows, 3] = mesh.walls[:-1]
-    latest[:] = [mesh]
-    trials = [True] * _CENTERINGS if straight and not spared else []
-    centered = least_bad(mesh, state, sizes, _Made.weigh_oblique, center, remake, trials)
-    mesh = min(centered, mesh, key=lambda made: len(made.rejected))
-    if straight and not spared:
-        mesh = straightened(mesh)
-        if 0 < np.count_nonzero(mesh.weigh_left()) <= _FEW_LEFT:
-            state[:, :3], state[:, 3] = mesh.near.points, EXACT
-            state[mesh.near.rows, 3] = mesh.walls[:-1]
-            goes_on = [False] * _LAST_MOVES
-            mesh = least_bad(mesh, state, sizes, _Made.weigh_left, change, remake_straight, goes_on)
+    mesh = _Trials(surface, points, sizes, whole, tell, held, straight).best()
     tell("cells without walls")
     faces, home = mesh.near.put_back(mesh.faces, mesh.home, mesh.own)
     if warns:
@@ -298,6 +212,151 @@ def solid_diagram(
     diagram = diagram_of(faces)
     diagram.home = home
     return diagram
+
+
+class _Trials:
+    """Makes the mesh of a solid, and again with moved generators or simpler walls; see `solid_diagram`.
+
+    A state (n, 4) of a trial has the generators, and how simple the walls of their cells are.
+    """
+
+    def __init__(
+        self,
+        surface: WallSurface,
+        points: np.ndarray,
+        sizes: np.ndarray,
+        whole: Callable[[np.ndarray], Faces],
+        tell: Callable[[str], object],
+        held: int,
+        straight: bool,
+    ) -> None:
+        self.surface, self.points, self.sizes, self.whole = surface, points, sizes, whole
+        self.tell, self.held, self.straight = tell, held, straight
+        self._tree = scipy.spatial.KDTree(points)
+
+    def best(self) -> _Made:
+        """Return the mesh with the fewest rejected cells, then the least oblique faces."""
+        state = np.column_stack([self.points, np.full(len(self.points), EXACT)])
+        mesh = self._remade(state, None)
+        assert mesh is not None
+        spared = self.straight and _are_many(mesh.near, mesh.rejected)
+        if not spared:
+            goes_on = [True] * _SIMPLER + MOVES * [False, *[True] * _SIMPLER_AFTER]
+            mesh = self._least_bad(mesh, state, _Made.count_rejected, self._remade, goes_on)
+        if not self.straight or spared:
+            return mesh
+        self._latest = mesh
+        centered = least_bad(
+            mesh,
+            self._state_of(mesh),
+            self.sizes,
+            _Made.weigh_oblique,
+            self._centered,
+            self._remade,
+            [True] * _CENTERINGS,
+        )
+        mesh = self._straightened(min(centered, mesh, key=lambda made: len(made.rejected)))
+        if not 0 < np.count_nonzero(mesh.weigh_left()) <= _FEW_LEFT:
+            return mesh
+        goes_on = [False] * _LAST_MOVES
+        return self._least_bad(mesh, self._state_of(mesh), _Made.weigh_left, self._remade_straight, goes_on)
+
+    def _least_bad(
+        self,
+        mesh: _Made,
+        state: np.ndarray,
+        badness: Callable[[_Made], np.ndarray],
+        remake: Callable[[np.ndarray, _Made | None], _Made | None],
+        goes_on: list[bool],
+    ) -> _Made:
+        """Return the best mesh of trials: walls become simpler or, where `goes_on` is False, generators move."""
+
+        def change(state: np.ndarray, rows: np.ndarray, number: int) -> np.ndarray:
+            if goes_on[number]:
+                return self._simpler(state, rows)
+            return self._moved(state, rows, goes_on[:number].count(False))
+
+        return least_bad(mesh, state, self.sizes, badness, change, remake, goes_on)
+
+    def _state_of(self, mesh: _Made) -> np.ndarray:
+        """Return the state of which `mesh` was made."""
+        state = np.column_stack([mesh.near.points, np.full(len(self.points), EXACT)])
+        state[mesh.near.rows, 3] = mesh.walls[:-1]
+        return state
+
+    def _remade(self, state: np.ndarray, last: _Made | None) -> _Made | None:
+        """Return the mesh of a state, if there is one. What it shares with the `last` mesh is taken from there."""
+        points, near = state[:, :3], None if last is None else last.near
+        if last is not None and last.cures is not None and last.cures.are_spent:
+            return None
+        if near is None or not np.array_equal(near.points, points):
+            near = NearWalls.of(self.surface, points, self.sizes, self.whole(points))
+        try:
+            self.tell(f"walls of {len(near.rows)} cells")
+            raw = _Maker(self.surface, near, np.append(state[near.rows, 3], EXACT)).mesh()
+            _check_lost(self.surface, near, raw.home)
+        except InputError:  # a simpler cell of a thin part may be nothing
+            if last is None:
+                raise
+            return None
+        cures, spares = None if last is None else last.cures, self.straight and last is None
+        self._latest = _finished(self.surface, raw, cures, self.tell, spares)
+        return self._latest
+
+    def _remade_straight(self, state: np.ndarray, last: _Made | None) -> _Made | None:
+        made = self._remade(state, last)
+        return None if made is None else self._straightened(made)
+
+    def _straightened(self, made: _Made) -> _Made:
+        """Return a mesh whose oblique faces are turned or collapsed where that helps."""
+        oblique, near = made.oblique_cells(), made.near
+        if not len(oblique):
+            return made
+        names, h = near.numbers[made.home], near.sizes[made.home]
+        faces, origin, own, rejected, _ = cured(
+            self.surface, made.faces, names, made.own, h, made.rejected, oblique=oblique
+        )
+        return replace(made, faces=faces, home=made.home[origin], own=own, rejected=rejected)
+
+    def _moved(self, state: np.ndarray, rows: np.ndarray, move: int) -> np.ndarray:
+        """Return the state with the generators `rows` (k,) moved for the `move`-th time."""
+        if len(rows) > FEW * len(state):
+            return state
+        surface, sizes, trial = self.surface, self.sizes, state.copy()
+        trial[:, :3] = moved(surface.solid, self._depth, sizes, state[:, :3], rows, move, self.held)
+        trial[rows, 3] = EXACT
+        if surface.widths.min() < SNAP_CREASE * sizes.max(initial=0.0):
+            # Generators around narrow facets stay, unless OpenFOAM rejects their own cells.
+            beside = np.setdiff1d(np.flatnonzero((trial[:, :3] != state[:, :3]).any(axis=1)), rows)
+            edge = surface.nearest_crease(state[beside, :3], _AROUND * sizes[beside])[0]
+            beside = beside[edge >= 0][surface.solid.creases.concave[edge[edge >= 0]]]
+            trial[beside, :3] = state[beside, :3]
+        return trial
+
+    def _simpler(self, state: np.ndarray, rows: np.ndarray) -> np.ndarray:
+        """Return the state with simpler walls of the cells `rows` (k,) at creases, and of those beside them."""
+        trial = state.copy()
+        creased = rows[self.surface.nearest_crease(state[rows, :3], _CREASED * self.sizes[rows])[0] >= 0]
+        rounded = creased[state[creased, 3] == ROUNDED]
+        beside = self._tree.query_ball_point(self.points[rounded], _BESIDE * self.sizes[rounded])
+        creased = np.array(sorted({*creased.tolist()}.union(*beside)), np.int64)
+        trial[creased, 3] = np.minimum(state[creased, 3] + 1, ROUNDED)
+        return trial
+
+    def _centered(self, state: np.ndarray, rows: np.ndarray, number: int) -> np.ndarray:
+        """Return the state with the generators `rows` (k,) at the centroids of their cells in the latest mesh."""
+        del number
+        made, trial = self._latest, state.copy()
+        home = np.where(made.own, made.near.numbers[made.home], -1)
+        cells = np.flatnonzero(np.isin(home, rows[rows >= self.held]))
+        rows, x = home[cells], made.faces.measures.geometry.centroids[cells]
+        far = np.linalg.norm(x - state[rows, :3], axis=1) > _OFF_CENTER * self.sizes[rows]
+        far[far] = self._depth(x[far]) > 0
+        trial[rows[far], :3] = x[far]
+        return trial
+
+    def _depth(self, x: np.ndarray) -> np.ndarray:
+        return -self.surface.closest(x)[2]
 
 
 def _warn_of(mesh: _Made, home: np.ndarray) -> None:

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-import scipy
+
+from ...graphs import components
 
 SMOOTH, CONVEX, CONCAVE = 0, 1, 2
 """Kinds of the sides and corners of triangles; a patch goes on across smooth and convex ones."""
@@ -157,8 +158,7 @@ def even_turns(turns: np.ndarray, twin: np.ndarray, group: np.ndarray, border: n
 
 def connect(n: int, pairs: np.ndarray) -> tuple[int, np.ndarray]:
     """Return the number of components of a graph of n nodes with edges `pairs` (m, 2), and that of each node."""
-    graph = scipy.sparse.coo_array((np.ones(len(pairs), bool), (pairs[:, 0], pairs[:, 1])), shape=(n, n))
-    count, label = scipy.sparse.csgraph.connected_components(graph, directed=False)
+    count, label = components(n, *pairs.T)
     first = np.unique(label, return_index=True)[1]
     rank = np.empty(count, np.int64)
     rank[np.argsort(first)] = np.arange(count)

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import scipy
 
+from ...graphs import components
 from ..columns import Columns
 from ..nearest_triangles import NearestTriangles
 from ..surface import Surface
@@ -103,8 +104,7 @@ def _clusters(x: np.ndarray, h: np.ndarray) -> list[np.ndarray]:
     """Return the rows of points x (n, 3) that are near each other, in units of h (n,): one array for each place."""
     pairs = scipy.spatial.KDTree(x).query_pairs(float(h.max()), output_type="ndarray")
     pairs = pairs[np.linalg.norm(x[pairs[:, 0]] - x[pairs[:, 1]], axis=1) < h[pairs].min(axis=1)]
-    graph = scipy.sparse.coo_array((np.ones(len(pairs)), pairs.T), (len(x), len(x)))
-    count, part = scipy.sparse.csgraph.connected_components(graph, directed=False)
+    count, part = components(len(x), *pairs.T)
     order = np.argsort(part, kind="stable")
     return np.split(order, np.searchsorted(part[order], np.arange(1, count)))
 

@@ -10,11 +10,11 @@ from os import PathLike
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import scipy
 
 from ...arguments import format_point
 from ...errors import InputError, InputTypeError
 from ...files import pack_array, unpack_array
+from ...graphs import components
 from ..borders import Borders, Size
 from ..columns import Columns
 from ..domain import Domain
@@ -198,8 +198,7 @@ class Surfaces(Borders):
         rows = np.flatnonzero(joins)
         scale = np.minimum(diagram.volumes[f.owner[rows]], diagram.volumes[f.neighbor[rows]]) ** (2 / 3)
         rows = rows[f.area[rows] > _SMALL * scale]
-        graph = scipy.sparse.coo_array((np.ones(len(rows), bool), (f.owner[rows], f.neighbor[rows])), (n, n))
-        count, label = scipy.sparse.csgraph.connected_components(graph, directed=False)
+        count, label = components(n, f.owner[rows], f.neighbor[rows])
         volumes = np.bincount(label, diagram.volumes, count)
         rank = np.empty(count, np.int32)
         rank[np.lexsort((np.arange(count), -np.round(volumes / volumes.sum(), 9)))] = np.arange(count)
