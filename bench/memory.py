@@ -32,8 +32,7 @@ from _kinds import KINDS, SQUARE, Kind
 import clvoro
 from clvoro.opencl.engine import Engine
 from clvoro.remapping.cell_data import transfer_values
-from clvoro.remapping.device_transfer import transfer_bytes
-from clvoro.remapping.pieces import Pieces
+from clvoro.remapping.device_transfer import Pieces, transfer_bytes
 
 PACKAGE = Path(clvoro.__file__).parent
 PLUMBING = {"device_array", "engine", "memory_limits", "primitives", "program"}

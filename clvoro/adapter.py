@@ -35,10 +35,9 @@ from .geometry.domain import Domain
 from .mesh.diagram import Diagram
 from .mesh.results import Result, Transported
 from .opencl import devices as device
-from .opencl.build_notice import BuildNotice, report_builds
 from .opencl.engine import Engine
 from .opencl.peers import ALONE, Peers, peers_of
-from .opencl.prebuild import renew
+from .opencl.prebuild import BuildNotice, renew, report_builds
 from .opencl.probe import check_process
 from .opencl.threads import Team, Threads
 from .tessellation.readback.diagram import make_diagram

@@ -71,7 +71,7 @@ OF_KERNELS = re.compile(r"\bkernels\b(\(.*\)|\[.*\])?\)?$|\b_kernels\b(\(.*\)|\[
 """An expression in Python that stands for the kernels of a file."""
 PARTS = {
     "solvers.poisson": {"solvers.conjugate_gradient", "solvers.multigrid"},
-    "solvers.multigrid": {"solvers.aggregation", "solvers.cycle"},
+    "solvers.multigrid": {"solvers.aggregation"},
     "solvers.transport": {"solvers.poisson"},
     "tessellation.cells": {"tessellation.part"},
     "tessellation.polyhedra": {"tessellation.part"},

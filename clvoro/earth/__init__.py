@@ -7,8 +7,7 @@ the solver "mpas" (`finite_volumes.gate`).
 
 from ..finite_volumes.gate import SOLVERS
 from ..io import CONVENTIONS, READERS
-from . import graded  # noqa: F401  registers size fields on spheres
-from .criteria import check_for_mpas
+from .c_grid import check_for_mpas
 from .lonlat_grid import from_xarray
 from .mpas import write_mpas
 from .netcdf_read import load_netcdf

@@ -1,4 +1,4 @@
-"""Measures of a mesh for C grids, on which unknowns are at the cells, the edges and the vertices.
+"""Measures, weights and criteria of a mesh for C grids, on which unknowns are at the cells, the edges and the vertices.
 
 Such schemes interpolate between a Voronoi diagram and its Delaunay triangles, as TRiSK does (Thuburn et al. 2009, J.
 Comput. Phys. 228, 8321; Ringler et al. 2010, J. Comput. Phys. 229, 3065). They need vertices inside of their triangles,
@@ -14,7 +14,24 @@ from typing import Any
 import numpy as np
 
 from ..errors import InputError
+from ..finite_volumes.criteria import Criterion, Rows, SolverReport
+from ..finite_volumes.gate import LEAST_MEASURE
+from ..finite_volumes.solver_mesh import WallShape
 from ..mesh.diagram import Diagram
+from ..mesh.faces import OFF_BISECTOR
+from ..mesh.half_faces import HalfEdges
+
+_SHORTEST_EDGE = 1e-6
+"""Least ratio of the length of an edge to the distance of its generators: C-grid schemes divide by the length."""
+_LEAST_ANGLE = 30.0
+"""Angle of a triangle, in degrees, below which the mesh is warned of."""
+_LEAST_EDGE_RATIO = 0.1
+"""Ratio of the shortest to the longest edge of a cell below which the mesh is warned of."""
+_MOST_CENTROID_OFFSET = 0.1
+"""Distance from generator to centroid over the size of the cell above which the mesh is warned of.
+
+C grids take the value at the generator for the mean over the cell, which is of second order at the centroid only."""
+
 
 RIGHT_ANGLE = 90 + 1e-4
 """Angle in degrees above which a triangle counts as obtuse. Those of a square lattice have 90 up to round-off."""
@@ -187,3 +204,126 @@ def _kites(d: Diagram, own: np.ndarray, before: np.ndarray, vertex: np.ndarray, 
     """Return the signed areas of quadrilaterals own, before, vertex, after, counter-clockwise, (k,)."""
     areas = d.domain.triangle_areas
     return areas(own, before, vertex) + areas(own, vertex, after)
+
+
+def check_for_mpas(diagram: Diagram, walls: WallShape | None) -> SolverReport:
+    """Check `diagram` by the criteria of models on C grids.
+
+    Raises `InputError` in 3D, or if `walls` is given.
+    """
+    if walls is not None:
+        raise InputError(f"walls is {walls!r:.60}, and solver 'mpas'; walls are for 'openfoam', leave it out")
+    faces, domain, made = int(diagram.faces.owner.size), diagram.domain, _criteria(diagram)
+    if domain.globe:
+        made = [criterion.on_sphere(domain.globe) for criterion in made]
+    return SolverReport("mpas", tuple(made), len(diagram), faces, 0.0)
+
+
+def _edges_once(diagram: Diagram, m: CGridMeasures) -> tuple[np.ndarray, Rows]:
+    """Return a half-face for each edge between two cells, (k,) int, and these edges as `Rows`, which make criteria."""
+    inner = np.flatnonzero(m.inner)
+    inner = inner[inner < diagram.half_faces.opposite[inner]]
+    return inner, Rows(diagram.face_centroids[inner], diagram.half_faces.owner[inner], diagram.domain.dim)
+
+
+def _at_walls(diagram: Diagram, edges: Rows, off_bisector: np.ndarray) -> list[Criterion]:
+    """Return the criteria that cut cells at walls may break: edges lie on bisectors, and three meet at a vertex."""
+    if not diagram.domain.cuts_cells:
+        return []
+    f = diagram.faces
+    ends = f.corners.reshape(-1, 2)
+    count = np.bincount(ends.ravel(), minlength=len(f.points))
+    at_wall, row = np.unique(ends[f.n_inner :], return_index=True)
+    vertices = Rows(f.points[at_wall], f.owner[f.n_inner :][row // 2], f.dim)
+    return [
+        edges("edge off its bisector", off_bisector, OFF_BISECTOR),
+        vertices("edges at a vertex", count[at_wall], 3),
+    ]
+
+
+def coast_faults(diagram: Diagram) -> list[Criterion]:
+    """Return the criteria that the walls of a polygon break, so that no model on a C grid can use the mesh."""
+    if not diagram.domain.cuts_cells:
+        return []
+    m = measure_c_grid(diagram)
+    inner, edges = _edges_once(diagram, m)
+    return [c for c in _at_walls(diagram, edges, m.off_bisector[inner]) if not c.ok]
+
+
+def _criteria(diagram: Diagram) -> list[Criterion]:
+    """Return the criteria for meshes of MPAS."""
+    d, m = diagram, measure_c_grid(diagram)
+    dim, owner = d.domain.dim, diagram.half_faces.owner
+    inner, edges = _edges_once(d, m)
+    cells = Rows(d.points, None, dim)
+    places, cell = d.vertices[d.half_faces.ends[m.corners, 0]], owner[m.corners]
+    corners, vertices = Rows(places, cell, dim), Rows(places[m.first], cell[m.first], dim)
+    return [
+        *_at_walls(diagram, edges, m.off_bisector[inner]),
+        cells("edges of a cell", np.diff(d.neighbor_starts), 3, above=False),
+        cells("cell area", d.volumes, LEAST_MEASURE, above=False),
+        edges("edge length over distance", m.length_ratio[inner], _SHORTEST_EDGE, above=False),
+        corners("largest angle of triangle", m.angles, RIGHT_ANGLE),
+        corners("smallest angle of triangle", m.angles, _LEAST_ANGLE, above=False, demanded=False),
+        corners("kite area over cell area", m.kites, 0, above=False),
+        vertices("cells at a vertex", m.vertex_cells[m.first], 3, demanded=False),
+        edges("edge offset", m.edge_offset[inner], 0.5, demanded=False),
+        cells("centroid offset", m.centroid_offset, _MOST_CENTROID_OFFSET, demanded=False),
+        cells("edge ratio", m.edge_ratio, _LEAST_EDGE_RATIO, above=False, demanded=False),
+    ]
+
+
+@dataclass(frozen=True)
+class Weights:
+    """Weights for tangential velocities (Thuburn et al. 2009), as ragged rows, one per edge.
+
+    The tangential velocity at edge e is the sum of w(e, e') u(e') over all other edges e' of its two cells i, with the
+    normal velocities u and
+
+        w(e, e') = n(e, i) n(e', i) (1/2 - sum R) l(e') / d(e)
+
+    Here l is the length of an edge, d the distance of its generators, and n is 1 if the normal of the edge points out
+    of the cell, -1 if it points inwards. R is the share of a vertex' kite in the area of the cell. The sum of R is over
+    the vertices between e and e', counter-clockwise around the cell.
+    """
+
+    counts: np.ndarray
+    """(e,) int. Number of other edges in each row."""
+    edges: np.ndarray
+    """(w,) int. The other edges, counter-clockwise from the edge on: those of the lower cell, then those of the other
+    cell."""
+    values: np.ndarray
+    """(w,) float. The weight of each of these edges."""
+
+
+def find_weights(halves: HalfEdges, shares: np.ndarray, lengths: np.ndarray, distances: np.ndarray) -> Weights:
+    """Return the weights. The normal of an edge points out of its lower cell.
+
+    - `shares` (h,) float: share of the kite at the begin of each half-edge in the area of its cell.
+    - `lengths`, `distances` (e,) float: lengths of edges, and distances between their generators.
+    """
+    sides = halves.counts[halves.cell]
+    first, twin = halves.first, halves.twin[halves.first]
+    counts = sides[first] - 1
+    pairs = twin >= 0
+    place = np.empty(len(sides), np.int64)
+    place[twin[pairs]] = counts[pairs]
+    counts[pairs] += sides[twin[pairs]] - 1
+    place[first] = 0
+    place += (np.cumsum(counts) - counts)[halves.edge]
+    normal = np.full(len(sides), -1.0)
+    normal[first] = 1
+    edges, values = np.empty(counts.sum(), np.int64), np.empty(counts.sum())
+    here = there = np.arange(len(sides))
+    passed = np.zeros(len(sides))
+    for step in range(1, int(sides.max())):
+        going = sides[here] > step
+        here, there = here[going], halves.next[there[going]]
+        passed = passed[going] + shares[there]
+        at, edge = place[here] + step - 1, halves.edge[there]
+        edges[at] = edge
+        # Files of others may have distances of 0. They are refused later.
+        with np.errstate(divide="ignore"):
+            ratio = lengths[edge] / distances[halves.edge[here]]
+        values[at] = normal[here] * normal[there] * (0.5 - passed) * ratio
+    return Weights(counts, edges, values)

@@ -23,9 +23,7 @@ from ..mesh.diagram import Diagram
 from ..mesh.faces import OFF_BISECTOR
 from ..mesh.half_faces import HalfEdges
 from ..mesh.straightening import cross
-from .c_grid import off_bisector
-from .criteria import coast_faults
-from .trisk import find_weights
+from .c_grid import coast_faults, find_weights, off_bisector
 
 
 @dataclass(frozen=True)

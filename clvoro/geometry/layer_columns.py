@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .curves.curve import angles
+from .curves import angles
 from .polygon import Polygon
 
 _SHARP = math.radians(50)  # turn of the boundary at which one row ends and another one begins

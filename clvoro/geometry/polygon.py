@@ -19,14 +19,13 @@ from ..arguments import check_rows, format_point, warn
 from ..errors import InputError, InputTypeError, MismatchWarning
 from ..opencl.engine import Traits
 from .boundary_names import BoundaryNames, Walls
-from .curved_edges import CurvedEdges
 from .curves import Curve
 from .domain import Domain
 from .edge_bins import EdgeBins
 from .fixed_generators import FixedGenerators, place_around_corners
 from .gaps import NarrowPart, find_narrow_parts
 from .geojson import may_be_degrees, pieces_of_description, pieces_of_geojson, pieces_of_shape, pieces_of_wkt, squeezed
-from .rings import REPAIRED, OrientedRings, make_rings, project, repaired, signed_area
+from .rings import REPAIRED, CurvedEdges, OrientedRings, make_rings, project, repaired, signed_area
 from .shapes import Edges
 from .simplification import pieces_of, simplify
 

@@ -18,8 +18,7 @@ from ..opencl import probe
 from ..opencl.devices import shared_context
 from ..opencl.engine import PLAIN, Engine, Traits
 from ..opencl.memory_limits import available_memory, in_bytes
-from .device_transfer import CellData, CellGraph, ConservativeTransfer, Space, transfer_bytes
-from .pieces import Pieces
+from .device_transfer import CellData, CellGraph, ConservativeTransfer, Pieces, Space, transfer_bytes
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike

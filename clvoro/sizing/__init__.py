@@ -29,13 +29,12 @@ from .estimates import (
 )
 from .evaluation import Sizing
 from .expression import Expression
-from .feature import FeatureSize
+from .feature import FeatureSize, curvature_size, gap_size
 from .field import Constant, Field, Function, as_field, maximum, minimum
 from .graded import Graded
 from .raster import Raster, Scattered
 from .region import Region
 from .solution import gradient_size, hessian_size
-from .surface_sizes import curvature_size, gap_size
 
 __all__ = [
     "Ball",

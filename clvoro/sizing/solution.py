@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, overload
 import numpy as np
 
 from ..errors import InputError
-from .estimates import SMOOTHED, Estimate, curvature_of, estimate, steepness
-from .profiles import Places, best_sizes, check_p
+from .estimates import SMOOTHED, Estimate, Places, best_sizes, check_p, curvature_of, estimate, steepness
 from .raster import Raster, check_box, fill_missing
 
 if TYPE_CHECKING:

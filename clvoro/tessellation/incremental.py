@@ -13,9 +13,8 @@ import pyopencl.array as cla
 from ..geometry.domain import ClipBox
 from ..opencl.engine import Engine
 from ..opencl.primitives import Scan
-from .cells import Cells, most_faces, verdict
+from .cells import Cells, FaceRows, most_faces, spare_slots, verdict
 from .device_diagram import Follow, Tessellation, read_report
-from .face_rows import FaceRows, spare_slots
 from .report import DOUBT, LISTED, SIZE, UNFINISHED, WRONG, with_room
 
 MAX_ROUNDS = 6

@@ -31,8 +31,7 @@ from clvoro.opencl.engine import Engine
 from clvoro.opencl.memory_limits import available_memory
 from clvoro.remapping import cell_data
 from clvoro.remapping.cell_data import transfer_values
-from clvoro.remapping.device_transfer import transfer_bytes
-from clvoro.remapping.pieces import Pieces
+from clvoro.remapping.device_transfer import Pieces, transfer_bytes
 from clvoro.solvers import poisson
 
 BENCH = Path(__file__).parents[2] / "bench"

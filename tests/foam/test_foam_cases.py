@@ -15,11 +15,10 @@ from clvoro import foam, sizing
 from clvoro.cli.command import main
 from clvoro.errors import ClvoroError, InputError, InputTypeError, LostFieldsWarning
 from clvoro.foam import case as cases
-from clvoro.foam import fluxes
+from clvoro.foam import transfer
 from clvoro.foam.case import FoamCase
-from clvoro.foam.fluxes import MOST_DIVERGENCE, divergence
 from clvoro.foam.mesh import FoamMesh, polygon_of_edges
-from clvoro.foam.transfer import _along_line
+from clvoro.foam.transfer import MOST_DIVERGENCE, _along_line, divergence
 from clvoro.io import foam_read
 
 HOLE = [(0.9, 0.4), (1.1, 0.4), (1.1, 0.6), (0.9, 0.6)]
@@ -583,9 +582,9 @@ def test_iterations_project_fluxes_as_a_factorization_does(template, monkeypatch
     at_boundary = np.zeros(len(mesh.owner) - len(mesh.neighbor))
     free = np.isin(np.arange(len(mesh.neighbor), len(mesh.owner)), mesh.patches[1].faces) & is_open
     made = []
-    for most in (fluxes._DIRECT, 0):
-        monkeypatch.setattr(fluxes, "_DIRECT", most)
-        made.append(fluxes.project_fluxes(mesh, velocity(mesh.centroids), at_boundary, free))
+    for most in (transfer._DIRECT, 0):
+        monkeypatch.setattr(transfer, "_DIRECT", most)
+        made.append(transfer.project_fluxes(mesh, velocity(mesh.centroids), at_boundary, free))
         assert divergence(mesh, made[-1]) < MOST_DIVERGENCE
     assert made[1] == pytest.approx(made[0], abs=1e-9 * np.abs(made[0]).max())
 

@@ -7,7 +7,7 @@ import shapely.affinity
 
 import clvoro
 from clvoro.errors import InputError, InputTypeError
-from clvoro.geometry.simplification.triangles import Triangles, divided_boundary, narrow_parts
+from clvoro.geometry.simplification import Triangles, divided_boundary, narrow_parts
 
 BOX = [(0, 0), (1, 0), (1, 1), (0, 1)]
 H = 0.1

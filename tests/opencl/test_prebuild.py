@@ -15,10 +15,10 @@ import pyopencl as cl
 import pytest
 
 import clvoro
-from clvoro.opencl import build_notice, prebuild, program
 from clvoro.opencl import engine as engines
-from clvoro.opencl.build_notice import BuildNotice, report_builds
+from clvoro.opencl import prebuild, program
 from clvoro.opencl.engine import Engine
+from clvoro.opencl.prebuild import BuildNotice, report_builds
 from clvoro.opencl.program import POCL, UNOPTIMIZED
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "bench"))
@@ -146,7 +146,7 @@ def test_line_appears_after_a_while_and_is_cleared(monkeypatch):
     notice.show(1)
     notice.clear()
     assert sys.stderr.getvalue() == ""
-    monkeypatch.setattr(build_notice, "PATIENCE", 0)
+    monkeypatch.setattr(prebuild, "PATIENCE", 0)
     notice.show(2)
     assert sys.stderr.getvalue().startswith("\rclvoro builds kernels, once for this device: 2 of 3")
     notice.show(3)
@@ -158,8 +158,8 @@ def test_line_appears_after_a_while_and_is_cleared(monkeypatch):
 
 @pytest.mark.parametrize(("new", "terminal", "lines"), [(5, True, 1), (5, False, 0), (0, True, 0)])
 def test_only_first_runs_on_terminals_show_a_line(engine, monkeypatch, new, terminal, lines):
-    monkeypatch.setattr(build_notice, "build_ahead", lambda *_: new)
-    monkeypatch.setattr(build_notice, "PATIENCE", 0)
+    monkeypatch.setattr(prebuild, "build_ahead", lambda *_: new)
+    monkeypatch.setattr(prebuild, "PATIENCE", 0)
     monkeypatch.setattr(sys, "stderr", Terminal() if terminal else io.StringIO())
     with report_builds(engine, None):
         assert engine.kernels("opencl/primitives").gather_rows
@@ -168,7 +168,7 @@ def test_only_first_runs_on_terminals_show_a_line(engine, monkeypatch, new, term
 
 
 def test_callback_replaces_the_line(engine, monkeypatch):
-    monkeypatch.setattr(build_notice, "build_ahead", lambda *_: 2)
+    monkeypatch.setattr(prebuild, "build_ahead", lambda *_: 2)
     monkeypatch.setattr(sys, "stderr", Terminal())
     told = []
     with report_builds(engine, lambda built, total: told.append((built, total))):

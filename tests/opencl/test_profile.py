@@ -10,8 +10,8 @@ import pytest
 import clvoro
 from clvoro.cli import command as cli
 from clvoro.errors import InputError
-from clvoro.opencl import costs, profile, ranges
 from clvoro.opencl import hooks as _hooks
+from clvoro.opencl import profile, ranges
 from clvoro.opencl.engine import Engine
 from clvoro.opencl.launch import one_group_limit
 from clvoro.opencl.profile import Profile, copy_bandwidth, profiled_queue
@@ -231,7 +231,7 @@ def test_table_agrees_with_the_profile(run):
 def test_command_line(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     # Kernels of a small share of the time are not listed apart: which those are, the machine's load decides.
-    monkeypatch.setattr(costs, "SMALL", 0.0)
+    monkeypatch.setattr(profile, "SMALL", 0.0)
     options = "run paper --cells 90 --steps 3 --method coupled --no-report".split()
     assert cli.main([*options, "--json"]) == cli.OK
     assert "profile" not in json.loads(capsys.readouterr().out)

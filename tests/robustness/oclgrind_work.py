@@ -29,7 +29,7 @@ from clvoro.opencl.primitives import Scan
 from clvoro.sizing import Ball, Circle, ClosedPolyline, Distance, Expression, Graded, Raster, Sizing, Surface, minimum
 from clvoro.sizing.derivatives import CellStencils, Derivatives
 from clvoro.tessellation import back_ends
-from clvoro.tessellation.face_rows import SLOT
+from clvoro.tessellation.cells import SLOT
 from clvoro.tessellation.part import Part
 from clvoro.tessellation.tessellator import Tessellator
 from tests.reference.patch import BOX as PATCH
@@ -387,7 +387,7 @@ def fields(adapter: clvoro.Adapter) -> None:
 
 def multigrid(adapter: clvoro.Adapter) -> None:
     """The preconditioner, which runs use for larger meshes only, and a solve in two precisions."""
-    from clvoro.solvers import cycle
+    from clvoro.solvers import multigrid as multigrids
     from clvoro.solvers.poisson import SINGLE_PRECISION_TOLERANCE, Poisson
 
     n = 300  # the smallest number that needs all its kernels
@@ -404,7 +404,7 @@ def multigrid(adapter: clvoro.Adapter) -> None:
         assert solution.converged
         stage.apply(laplacian, potential, rhs)
     # The levels below the finest by one work-group each.
-    with mock.patch.object(cycle, "one_group_limit", return_value=n):
+    with mock.patch.object(multigrids, "one_group_limit", return_value=n):
         potential, kind = engine.zeros(n), "multigrid"
         alone = Poisson(engine).solve(laplacian, rhs, potential, tolerance=1e-3, preconditioner=kind)
         assert alone.converged

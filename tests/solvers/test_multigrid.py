@@ -10,7 +10,7 @@ from scipy.spatial import Delaunay
 
 from clvoro import create_context
 from clvoro.opencl.engine import Engine
-from clvoro.solvers import cycle
+from clvoro.solvers import multigrid as multigrids
 from clvoro.solvers.aggregation import Aggregation, Graph
 from clvoro.solvers.multigrid import Multigrid
 from clvoro.solvers.poisson import Laplacian, Poisson
@@ -187,7 +187,7 @@ def test_merged_steps_and_levels_give_the_same_bits(make, monkeypatch, name, gro
     right = np.random.default_rng(6).standard_normal(W.shape[0])
     engine = patch.make_engine(make().ctx, group_size=group_size)
     for most, merged in ((0, False), (0, True), (10**6, False), (300, True)):
-        monkeypatch.setattr(cycle, "one_group_limit", lambda _, most=most: most)
+        monkeypatch.setattr(multigrids, "one_group_limit", lambda _, most=most: most)
         multigrid = Multigrid(engine)
         multigrid._cycle.merged = merged
         multigrid.set_up(*upload(engine, W))

@@ -10,8 +10,7 @@ import clvoro
 from clvoro.opencl.engine import Engine
 from clvoro.tessellation import report
 from clvoro.tessellation.bins import Bins
-from clvoro.tessellation.cells import ROW_CAPACITY, Cells
-from clvoro.tessellation.face_rows import SLOT
+from clvoro.tessellation.cells import ROW_CAPACITY, SLOT, Cells
 from clvoro.tessellation.part import Part
 from clvoro.tessellation.readback.diagram import order_of, used_indices
 from tests.reference import diagrams as reference

@@ -8,8 +8,7 @@ import clvoro
 from clvoro.opencl.engine import Engine
 from clvoro.tessellation import cells as cells_module
 from clvoro.tessellation.bins import Bins
-from clvoro.tessellation.cells import Cells
-from clvoro.tessellation.face_rows import SLOT, spare_slots
+from clvoro.tessellation.cells import SLOT, Cells, spare_slots
 from clvoro.tessellation.incremental import IncrementalUpdate
 from clvoro.tessellation.part import Part
 from tests.reference import diagrams as reference

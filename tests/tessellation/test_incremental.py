@@ -8,8 +8,7 @@ from hypothesis import strategies as st
 from clvoro.opencl.engine import Engine
 from clvoro.tessellation import incremental as repair
 from clvoro.tessellation.bins import Bins
-from clvoro.tessellation.cells import Cells
-from clvoro.tessellation.face_rows import SLOT
+from clvoro.tessellation.cells import SLOT, Cells
 from clvoro.tessellation.incremental import IncrementalUpdate
 from clvoro.tessellation.part import Part
 from clvoro.tessellation.report import LISTED

@@ -5,8 +5,7 @@ import pytest
 
 from clvoro.tessellation import report
 from clvoro.tessellation.bins import Bins
-from clvoro.tessellation.cells import Cells
-from clvoro.tessellation.face_rows import SLOT
+from clvoro.tessellation.cells import SLOT, Cells
 from clvoro.tessellation.incremental import IncrementalUpdate
 from clvoro.tessellation.part import Part
 from tests.reference import patch
