@@ -349,15 +349,16 @@ inline void split_cell(int i, global const REAL *points, global const REAL *offs
     }
 }
 
-/* Per chosen site: split the cell (sign > 0) or delete it. */
-kernel void mark_split_delete(const int size, global const ulong *chosen, const REAL sign, global const REAL *points,
-                              global const REAL *offsets, global const REAL *covariances, global const REAL *volumes,
-                              global int *kept, global REAL *shifts, global int *born, global REAL *births)
+/* Per chosen site: split a cell of at least `split_from` faces, delete any other. */
+kernel void mark_split_delete(const int size, global const ulong *chosen, global const int *starts,
+                              const int split_from, global const REAL *points, global const REAL *offsets,
+                              global const REAL *covariances, global const REAL *volumes, global int *kept,
+                              global REAL *shifts, global int *born, global REAL *births)
 {
     WORK_ITEM(i);
     if (chosen[i] == 0)
         return;
-    if (sign < 0)
+    if (starts[i + 1] - starts[i] < split_from)
         kept[i] = 0;
     else
         split_cell(i, points, offsets, covariances, volumes, shifts, born, births);
@@ -377,21 +378,6 @@ kernel void score_bad_cells(const int size, global const int *starts, global con
     for (int k = starts[i]; k < starts[i + 1] && site; ++k)
         site = neighbors[k] >= 0;
     keys[i] = site ? site_key(odd + own, NAME(i)) : 0;
-}
-
-/* Per chosen site: split a cell of at least `split_from` sides, delete any other. */
-kernel void mark_bad_cells(const int size, global const ulong *chosen, global const int *starts, const int split_from,
-                           global const REAL *points, global const REAL *offsets, global const REAL *covariances,
-                           global const REAL *volumes, global int *kept, global REAL *shifts, global int *born,
-                           global REAL *births)
-{
-    WORK_ITEM(i);
-    if (chosen[i] == 0)
-        return;
-    if (starts[i + 1] - starts[i] < split_from)
-        kept[i] = 0;
-    else
-        split_cell(i, points, offsets, covariances, volumes, shifts, born, births);
 }
 #endif
 

@@ -13,14 +13,14 @@
 
 #ifdef POLYGON
 #include "geometry/edges.h"
-#define keep_inside keep_inside_polygon
+#define keep_inside keep_inside_by_path
 #define reflect_inside reflect_inside_polygon
 #elif defined(SOLID)
 #include "geometry/walls.h"
 #define DOMAIN_ARGS const REAL4 box_lower, const REAL4 box_upper, WALL_ARGS
 #define DOMAIN box_lower, box_upper, WALL
-#define keep_inside keep_inside_solid
-#define reflect_inside keep_inside_solid
+#define keep_inside keep_inside_by_path
+#define reflect_inside keep_inside_by_path
 #define exit_parameter exit_from_solid
 #elif defined(SPHERE)
 #define DOMAIN_ARGS const REAL4 box_lower, const REAL4 box_upper
@@ -112,15 +112,6 @@ inline REAL exit_from_solid(const REAL *x, const REAL *y, DOMAIN_ARGS)
     const REAL4 from = (REAL4)(x[0], x[1], x[2], 0), way = (REAL4)(y[0] - x[0], y[1] - x[1], y[2] - x[2], 0);
     return exit_through_wall(from, way, WALL);
 }
-
-/* Moves the target y of a generator at x into the domain: if the path leaves it, half-way to the boundary. */
-inline void keep_inside_solid(const REAL *x, REAL *y, DOMAIN_ARGS)
-{
-    const REAL t = exit_parameter(x, y, DOMAIN);
-    if (t <= 1)
-        EACH_AXIS (a)
-            y[a] = x[a] + t / 2 * (y[a] - x[a]);
-}
 #elif !defined(POLYGON)
 /* Move the target y of a generator at x into the domain: to the nearest wall, or to its image along a period. */
 inline void keep_inside_box(const REAL *x, REAL *y, DOMAIN_ARGS)
@@ -146,5 +137,35 @@ inline void reflect_inside_box(const REAL *x, REAL *y, DOMAIN_ARGS)
             y[a] = 2 * upper[a] - y[a];
     }
     keep_inside_box(x, y, DOMAIN);
+}
+#endif
+
+#if defined(POLYGON) || defined(SOLID)
+/* Moves the target y of a generator at x into the domain: if the path leaves it, half-way to the boundary. */
+inline void keep_inside_by_path(const REAL *x, REAL *y, DOMAIN_ARGS)
+{
+    const REAL t = exit_parameter(x, y, DOMAIN);
+    if (t <= 1)
+        EACH_AXIS (a)
+            y[a] = x[a] + t / 2 * (y[a] - x[a]);
+}
+#endif
+
+#ifdef POLYGON
+/* As keep_inside_by_path, but mirrors y at the edge, unless the path to the mirror image leaves the domain. */
+inline void reflect_inside_polygon(const REAL *x, REAL *y, DOMAIN_ARGS)
+{
+    int edge;
+    if (exit_over_edge(x, y, &edge, DOMAIN) > 1)
+        return;
+    const REAL2 a = edge_ends[edge].s01, e = edge_ends[edge].s23 - a;
+    const REAL beyond = ((y[0] - a.s0) * e.s1 - (y[1] - a.s1) * e.s0) / dot(e, e);
+    REAL back[2] = {y[0] - 2 * beyond * e.s1, y[1] + 2 * beyond * e.s0};
+    if (exit_parameter(x, back, DOMAIN) > 1) {
+        y[0] = back[0];
+        y[1] = back[1];
+    } else {
+        keep_inside_by_path(x, y, DOMAIN);
+    }
 }
 #endif

@@ -69,29 +69,3 @@ inline REAL exit_parameter(const REAL *x, const REAL *y, DOMAIN_ARGS)
     int edge;
     return exit_over_edge(x, y, &edge, DOMAIN);
 }
-
-/* Moves the target y of a generator at x into the domain: if the path leaves it, half-way to the boundary. */
-inline void keep_inside_polygon(const REAL *x, REAL *y, DOMAIN_ARGS)
-{
-    const REAL t = exit_parameter(x, y, DOMAIN);
-    if (t <= 1)
-        EACH_AXIS (a)
-            y[a] = x[a] + t / 2 * (y[a] - x[a]);
-}
-
-/* As keep_inside_polygon, but mirrors y at the edge, unless the path to the mirror image leaves the domain. */
-inline void reflect_inside_polygon(const REAL *x, REAL *y, DOMAIN_ARGS)
-{
-    int edge;
-    if (exit_over_edge(x, y, &edge, DOMAIN) > 1)
-        return;
-    const REAL2 a = edge_ends[edge].s01, e = edge_ends[edge].s23 - a;
-    const REAL beyond = ((y[0] - a.s0) * e.s1 - (y[1] - a.s1) * e.s0) / dot(e, e);
-    REAL back[2] = {y[0] - 2 * beyond * e.s1, y[1] + 2 * beyond * e.s0};
-    if (exit_parameter(x, back, DOMAIN) > 1) {
-        y[0] = back[0];
-        y[1] = back[1];
-    } else {
-        keep_inside_polygon(x, y, DOMAIN);
-    }
-}

@@ -59,40 +59,34 @@ inline void sum_add(Sum *s, REAL x)
 #endif
 }
 
-/* Sum (maximum) over the work-items of a group, returned to each. */
+/* x = the sum (maximum) over the work-items of a group, for each. */
+#if GROUP_SIZE > 1
+#define REDUCE_GROUP(x, COMBINE)                                                                                       \
+    const int me = get_local_id(0);                                                                                    \
+    local REAL *scratch = group.scratch;                                                                               \
+    barrier(CLK_LOCAL_MEM_FENCE);                                                                                      \
+    scratch[me] = x;                                                                                                   \
+    for (int half_ = GROUP_SIZE / 2; half_ > 0; half_ /= 2) {                                                          \
+        barrier(CLK_LOCAL_MEM_FENCE);                                                                                  \
+        if (me < half_)                                                                                                \
+            scratch[me] = COMBINE(scratch[me], scratch[me + half_]);                                                   \
+    }                                                                                                                  \
+    barrier(CLK_LOCAL_MEM_FENCE);                                                                                      \
+    x = scratch[0]
+#else
+#define REDUCE_GROUP(x, COMBINE)
+#endif
+#define SUM_OF_TWO(a, b) ((a) + (b))
+
 inline REAL group_sum(REAL x, group_t group)
 {
-#if GROUP_SIZE > 1
-    const int me = get_local_id(0);
-    local REAL *scratch = group.scratch;
-    barrier(CLK_LOCAL_MEM_FENCE);
-    scratch[me] = x;
-    for (int half_ = GROUP_SIZE / 2; half_ > 0; half_ /= 2) {
-        barrier(CLK_LOCAL_MEM_FENCE);
-        if (me < half_)
-            scratch[me] += scratch[me + half_];
-    }
-    barrier(CLK_LOCAL_MEM_FENCE);
-    x = scratch[0];
-#endif
+    REDUCE_GROUP(x, SUM_OF_TWO);
     return x;
 }
 
 inline REAL group_max(REAL x, group_t group)
 {
-#if GROUP_SIZE > 1
-    const int me = get_local_id(0);
-    local REAL *scratch = group.scratch;
-    barrier(CLK_LOCAL_MEM_FENCE);
-    scratch[me] = x;
-    for (int half_ = GROUP_SIZE / 2; half_ > 0; half_ /= 2) {
-        barrier(CLK_LOCAL_MEM_FENCE);
-        if (me < half_)
-            scratch[me] = fmax(scratch[me], scratch[me + half_]);
-    }
-    barrier(CLK_LOCAL_MEM_FENCE);
-    x = scratch[0];
-#endif
+    REDUCE_GROUP(x, fmax);
     return x;
 }
 

@@ -107,35 +107,29 @@ inline REAL pair_inverse(REAL own, REAL both, REAL ti, REAL tj)
 ROW_DIFFERENCE(first_step_difference, FIRST_STEP, REAL omega, global const int *partner, global const REAL *own,
                global const REAL *both, global const REAL *b)
 
+/* to = x + damping B^-1 (b - A x), for the pair of the work-item. */
+#define SMOOTH_PAIR(damping, VALUE, DIFFERENCE, to, ...)                                                               \
+    PAIR(i, j);                                                                                                        \
+    const REAL ti = b[i] - DIFFERENCE(i, n, starts, columns, weights, __VA_ARGS__);                                    \
+    const REAL tj = i == j ? ti : b[j] - DIFFERENCE(j, n, starts, columns, weights, __VA_ARGS__);                      \
+    to[i] = VALUE(i) + damping * pair_inverse(own[i], both[i], ti, tj);                                                \
+    if (i != j)                                                                                                        \
+    to[j] = VALUE(j) + damping * pair_inverse(own[j], both[j], tj, ti)
+
 /* Two steps from x = 0. */
 kernel void smooth_pairs_from_zero(int n, REAL omega, REAL next, global const int *starts, global const int *columns,
                                    global const REAL *weights, global const int *partner, global const REAL *own,
                                    global const REAL *both, global const REAL *b, global REAL *x)
 {
-    PAIR(i, j);
-    const REAL ti = b[i] - first_step_difference(i, n, starts, columns, weights, omega, partner, own, both, b);
-    const REAL tj =
-        i == j ? ti : b[j] - first_step_difference(j, n, starts, columns, weights, omega, partner, own, both, b);
-    x[i] = FIRST_STEP(i) + next * pair_inverse(own[i], both[i], ti, tj);
-    if (i != j)
-        x[j] = FIRST_STEP(j) + next * pair_inverse(own[j], both[j], tj, ti);
+    SMOOTH_PAIR(next, FIRST_STEP, first_step_difference, x, omega, partner, own, both, b);
 }
-
-/* to = x + omega B^-1 (b - A x), for the pair of the work-item. */
-#define SMOOTH_PAIR(VALUE, DIFFERENCE, to, ...)                                                                        \
-    PAIR(i, j);                                                                                                        \
-    const REAL ti = b[i] - DIFFERENCE(i, n, starts, columns, weights, __VA_ARGS__);                                    \
-    const REAL tj = i == j ? ti : b[j] - DIFFERENCE(j, n, starts, columns, weights, __VA_ARGS__);                      \
-    to[i] = VALUE(i) + omega * pair_inverse(own[i], both[i], ti, tj);                                                  \
-    if (i != j)                                                                                                        \
-    to[j] = VALUE(j) + omega * pair_inverse(own[j], both[j], tj, ti)
 
 /* One step, to another array. */
 kernel void smooth_pairs(int n, REAL omega, global const int *starts, global const int *columns,
                          global const REAL *weights, global const int *partner, global const REAL *own,
                          global const REAL *both, global const REAL *b, global const REAL *x, global REAL *to)
 {
-    SMOOTH_PAIR(ENTRY_OF_X, row_difference, to, x);
+    SMOOTH_PAIR(omega, ENTRY_OF_X, row_difference, to, x);
 }
 
 /* x + the correction of the aggregate. */
@@ -148,7 +142,7 @@ kernel void prolong_and_smooth_pairs(int n, REAL omega, global const int *starts
                                      global const REAL *both, global const REAL *b, global const REAL *x,
                                      global const int *aggregate, global const REAL *e, global REAL *to)
 {
-    SMOOTH_PAIR(CORRECTED, corrected_difference, to, x, aggregate, e);
+    SMOOTH_PAIR(omega, CORRECTED, corrected_difference, to, x, aggregate, e);
 }
 
 /* Restriction: b of an aggregate = sum of the defects b - A x of its members. */
@@ -282,6 +276,13 @@ inline level_t read_level(global const int *table, int depth)
     return level;
 }
 
+/* A level, its arrays, and the next coarser one. */
+#define FINE_AND_COARSE(depth)                                                                                         \
+    const level_t fine = read_level(table, depth), coarse = read_level(table, depth + 1);                              \
+    global const int *partner = ints + fine.partner, *starts = ints + fine.starts, *columns = ints + fine.columns;     \
+    global const REAL *own = reals + fine.own, *both = reals + fine.both, *weights = reals + fine.weights;             \
+    global REAL *bs = reals + fine.b, *xs = reals + fine.x, *ts = reals + fine.t
+
 /* The cycle from a coarse level on, by one work-group: x = correction for b. The last level is solved exactly. */
 kernel void cycle_by_group(int levels, REAL late, REAL early, global const int *table, global const int *ints,
                            global REAL *reals, global const REAL *factor, global const REAL *b, global REAL *x)
@@ -290,10 +291,7 @@ kernel void cycle_by_group(int levels, REAL late, REAL early, global const int *
     for (BLOCK_LOOP(i, top.n))
         reals[top.b + i] = b[i];
     for (int depth = 0; depth < levels - 1; ++depth) {
-        const level_t fine = read_level(table, depth), coarse = read_level(table, depth + 1);
-        global const int *partner = ints + fine.partner, *starts = ints + fine.starts, *columns = ints + fine.columns;
-        global const REAL *own = reals + fine.own, *both = reals + fine.both, *weights = reals + fine.weights;
-        global REAL *bs = reals + fine.b, *xs = reals + fine.x, *ts = reals + fine.t;
+        FINE_AND_COARSE(depth);
         barrier(CLK_GLOBAL_MEM_FENCE);
         for (BLOCK_LOOP(i, fine.n))
             xs[i] = late * apply_pair_inverse(i, partner, own, both, bs);
@@ -306,10 +304,7 @@ kernel void cycle_by_group(int levels, REAL late, REAL early, global const int *
     const level_t last = read_level(table, levels - 1);
     solve_coarsest(last.n, factor, reals + last.b, reals + last.t, reals + last.x);
     for (int depth = levels - 2; depth >= 0; --depth) {
-        const level_t fine = read_level(table, depth), coarse = read_level(table, depth + 1);
-        global const int *partner = ints + fine.partner, *starts = ints + fine.starts, *columns = ints + fine.columns;
-        global const REAL *own = reals + fine.own, *both = reals + fine.both, *weights = reals + fine.weights;
-        global REAL *bs = reals + fine.b, *xs = reals + fine.x, *ts = reals + fine.t;
+        FINE_AND_COARSE(depth);
         barrier(CLK_GLOBAL_MEM_FENCE);
         for (BLOCK_LOOP(i, fine.n))
             xs[i] += reals[coarse.x + ints[fine.aggregate + i]];

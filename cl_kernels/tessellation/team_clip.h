@@ -34,6 +34,24 @@ inline bool in_masks(uint a, uint b, int v)
     return ((v < 32 ? a : b) >> (v & 31)) & 1;
 }
 
+/* List the edges of the rim from vertex v, from number `place` on: to those of its neighbors that stay. */
+inline void list_rim_edges(local rim_t *rim, int v, INDEX4 f, INDEX4 links, bool first, bool second, bool third,
+                           int place)
+{
+    if (first) {
+        rim->edges[place] = (INDEX4)(f.s0, f.s1, links.s0, v);
+        rim->edge_after[f.s0] = place++;
+    }
+    if (second) {
+        rim->edges[place] = (INDEX4)(f.s1, f.s2, links.s1, v);
+        rim->edge_after[f.s1] = place++;
+    }
+    if (third) {
+        rim->edges[place] = (INDEX4)(f.s2, f.s0, links.s2, v);
+        rim->edge_after[f.s2] = place;
+    }
+}
+
 /* Find the rim around the vertices beyond the bisector, and the faces that are `dead`; see find_rim. Returns the number
    of edges, or -1 if it is not one simple cycle. */
 inline int team_rim(local shared_t *at, team_t *team, uint gone_a, uint gone_b, uint *dead)
@@ -83,34 +101,11 @@ inline int team_rim(local shared_t *at, team_t *team, uint gone_a, uint gone_b, 
     local rim_t *rim = &cell->rim;
     if (ga) {
         at->vacant[popcount(gone_a & below)] = lane;
-        if (a0) {
-            rim->edges[place] = (INDEX4)(f.s0, f.s1, links.s0, lane);
-            rim->edge_after[f.s0] = place++;
-        }
-        if (a1) {
-            rim->edges[place] = (INDEX4)(f.s1, f.s2, links.s1, lane);
-            rim->edge_after[f.s1] = place++;
-        }
-        if (a2) {
-            rim->edges[place] = (INDEX4)(f.s2, f.s0, links.s2, lane);
-            rim->edge_after[f.s2] = place;
-        }
+        list_rim_edges(rim, lane, f, links, a0, a1, a2, place);
     }
     if (gb) {
-        const int v = lane + 32;
-        at->vacant[popcount(gone_a) + popcount(gone_b & below)] = v;
-        if (b0) {
-            rim->edges[place_b] = (INDEX4)(g.s0, g.s1, others.s0, v);
-            rim->edge_after[g.s0] = place_b++;
-        }
-        if (b1) {
-            rim->edges[place_b] = (INDEX4)(g.s1, g.s2, others.s1, v);
-            rim->edge_after[g.s1] = place_b++;
-        }
-        if (b2) {
-            rim->edges[place_b] = (INDEX4)(g.s2, g.s0, others.s2, v);
-            rim->edge_after[g.s2] = place_b;
-        }
+        at->vacant[popcount(gone_a) + popcount(gone_b & below)] = lane + 32;
+        list_rim_edges(rim, lane + 32, g, others, b0, b1, b2, place_b);
     }
     TEAM_SYNC();
     if (gone > 6) {

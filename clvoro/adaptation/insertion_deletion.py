@@ -31,6 +31,7 @@ from .tuning import (
     WALL_STRAIN,
 )
 
+NEVER = 2**31 - 1  # faces from which cells are split, where all are deleted
 HISTOGRAM = 128  # a power of two, so that bins are divided evenly down to single keys
 
 
@@ -169,22 +170,21 @@ class InsertionDeletion:
         self._drop_fixed(present, keys, neighbors=True)
         chosen = self._choose(t, keys, PAIR_RINGS)
         self._limit(t, chosen, most)
-        cells = t.points, t.offsets, t.covariances, t.volumes
-        engine.run_each(k.mark_bad_cells, n, chosen, t.starts, np.int32(6 if split else 7), *cells, *marks.arrays)
+        self._mark_split_delete(t, chosen, 6 if split else 7, marks)
         self._room.clear("keys", "spread", "chosen", "latest")
         return self._apply(present, marks)
 
     def split_delete(self, present: Present, sites: tuple[cla.Array, cla.Array]) -> Outcome | None:
         """Split and delete cells at `sites`, each (n,) uint64 and not 0 at sites; otherwise as `insert_delete`."""
         t, marks = present.t, _Marks.clean(self._room, present.t, self.engine.dim)
-        for sign, chosen in zip((1, -1), sites, strict=True):
-            self._mark_split_delete(t, chosen, self.engine.real.type(sign), marks)
+        for split_from, chosen in zip((0, NEVER), sites, strict=True):
+            self._mark_split_delete(t, chosen, split_from, marks)
         return self._apply(present, marks)
 
-    def _mark_split_delete(self, t: Tessellation, chosen: cla.Array, sign: np.floating, marks: _Marks) -> None:
-        """Mark to split the `chosen` cells, or to delete them if `sign` is negative."""
-        cells = t.points, t.offsets, t.covariances, t.volumes
-        self.engine.run_each(self._kernels.mark_split_delete, t.n, chosen, sign, *cells, *marks.arrays)
+    def _mark_split_delete(self, t: Tessellation, chosen: cla.Array, split_from: int, marks: _Marks) -> None:
+        """Mark to split the `chosen` cells of at least `split_from` faces, and to delete the others."""
+        cells = t.starts, np.int32(split_from), t.points, t.offsets, t.covariances, t.volumes
+        self.engine.run_each(self._kernels.mark_split_delete, t.n, chosen, *cells, *marks.arrays)
 
     def _measure(self, t: Tessellation, h: cla.Array) -> tuple[cla.Array, cla.Array, cla.Array]:
         """Return charge and number of walls (n, 2), and the strain averaged over one and over two rings (n, 4)."""
@@ -277,7 +277,7 @@ class InsertionDeletion:
         engine.run_each(k.drop_sites, n, self.spread(t, marks.busy, LOG_RATIO_RINGS), keys)
         chosen = self._choose(t, keys, LOG_RATIO_RINGS)
         self._limit(t, chosen, rest if rest > 0 else min(-rest, self._count(t) - 1))
-        self._mark_split_delete(t, chosen, sign, marks)
+        self._mark_split_delete(t, chosen, 0 if rest > 0 else NEVER, marks)
 
     def _drop_fixed(self, present: Present, keys: cla.Array, neighbors: bool) -> None:
         """Remove sites at fixed generators and, with `neighbors`, next to them."""

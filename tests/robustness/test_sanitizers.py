@@ -95,7 +95,6 @@ FUNCTIONS = {
     "density.evaluate_density",
     "metric.evaluate_metric",
     "insertion_deletion.mark_split_delete",
-    "insertion_deletion.mark_bad_cells",
     "volume_projection.assemble_projection",
     "quality_descent.compute_cell_forces",
     "surface_descent.compute_surface_forces",
