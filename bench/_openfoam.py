@@ -199,7 +199,7 @@ class Case:
         control: Mapping[str, Any],
     ) -> None:
         """Write the dictionaries of a laminar flow, which is steady unless `schemes` say else."""
-        self.write("constant/transportProperties", {"transportModel": "Newtonian", "nu": viscosity})
+        self.write("constant/transportProperties", {"transportModel": "Newtonian", "nu": viscosity, "DT": 1})
         self.write("constant/turbulenceProperties", {"simulationType": "laminar"})
         common = {
             "ddtSchemes": {"default": "steadyState"},

@@ -1,10 +1,11 @@
-"""Flows in OpenFOAM on meshes of solids: cells of clvoro, tetrahedra of Gmsh, and their duals by polyDualMesh.
+"""Solutions of OpenFOAM on meshes of solids by clvoro, snappyHexMesh, polyDualMesh (duals of tetrahedra) and Gmsh.
 
     python bench/solid_flows.py [--flows sphere,bend] [--cells 1000,4000,16000] [--meshers NAMES] [--keep FOLDER]
                                 [--device NAME] [--json]
 
 All meshers get the same triangulated surface and a uniform size, scaled to nearly the same number of cells. Rows have
-the processor time of the mesh, what `checkMesh` says of it, and the error of the flow.
+the processor time of the last mesh, what `checkMesh` says of it, the largest distance of vertices of walls from the
+surface over the mean size of a cell, the iterations of the solver, and the errors of the solution.
 
 sphere: potential flow around a sphere (`potentialFoam`), with the velocity of the formula on the sides of a box. Errors
 are root mean squares of the velocity in cells over that of the stream: of all cells, of those at the sphere, and of
@@ -13,12 +14,20 @@ these by the fluxes of the formula, which is the error of the velocity's reconst
 bend: laminar flow through a bent pipe at Re 40 (`simpleFoam`), a parabola at the inlet. Errors are those of the loss of
 pressure, and of the velocity at 5,000 points, against a mesh of clvoro with --reference cells.
 
+bracket, flange: conduction of heat (`laplacianFoam`) with the temperatures of a formula on the walls, in a part of
+`_solid_shapes.py`, and in one of OpenFOAM's tutorials. Errors are root mean squares of the temperature over its
+standard deviation, and of its gradient over its root mean square.
+
+motorBike: laminar flow around a wrap of the tutorials' motorcycle at Re 40 (`simpleFoam`); cells at it are a quarter as
+wide as those far away. The figure is the drag of the pressure alone, over that of the stream on a square of length 1.
+
 Gmsh, trimesh and shapely (pip install gmsh trimesh shapely) and Debian's package openfoam are needed.
 """
 
 from __future__ import annotations
 
 import math
+import re
 import resource
 import tempfile
 from collections.abc import Callable
@@ -29,8 +38,10 @@ from typing import Any
 import numpy as np
 import scipy
 import shapely
-from _common import Report, counts, heading, make_adapter, names, parser
-from _openfoam import Case, Mesh, nonuniform, require
+from _common import Report, counts, heading, make_adapter, names, parser, random_points, shown
+from _openfoam import Case, Mesh, nonuniform, require, text_of
+from _solid_shapes import SHAPES, solid_of
+from solids import growing
 from solver_ready import figures_of
 from trimesh import creation
 
@@ -41,7 +52,8 @@ RADIUS, SIDE = 0.5, 1.0
 BEND, STRAIGHT, REYNOLDS = 1.5, 1.0, 40
 """Radius of the pipe's axis in the bend, and length of the straight parts, for a pipe of `RADIUS`."""
 ROUNDS = 4
-"""Meshes that Gmsh makes to meet a number of cells."""
+"""Most meshes that are made to meet a number of cells."""
+TUTORIALS = Path("/usr/share/doc/openfoam-examples/examples/resources/geometry")
 
 
 # Solids.
@@ -66,37 +78,105 @@ def bent_pipe() -> clvoro.Solid:
     return clvoro.Solid(part.vertices, part.faces, groups=groups, group_names=["wall", "inlet", "outlet"])
 
 
-# Meshers: each writes the polyMesh of a case.
+def flange() -> clvoro.Solid:
+    """Return a flange of OpenFOAM's tutorials."""
+    return clvoro.Solid.read(TUTORIALS / "flange.stl.gz", repair=True)
 
 
-def mesh_clvoro(layer: float) -> Callable[..., None]:
+def around_bike() -> clvoro.Solid:
+    """Return the air around a wrap of a motorcycle of OpenFOAM's tutorials."""
+    bike = clvoro.Solid.read(TUTORIALS / "motorBike.obj.gz", wrap=0.08, names={"body": "wall"})
+    sides = {"inlet": 0, "outlet": 1, "sides": [2, 3, 4, 5]}
+    return clvoro.Solid.outside(bike, clvoro.Box((-3, -2, 0), (6, 2, 4), names=sides))
+
+
+# Meshers.
+
+
+Mesher = Callable[[Case, clvoro.Adapter, clvoro.Solid, float, bool], int]
+"""Writes the polyMesh of a case with cells of a size, at a body half as wide or not; returns how many there are."""
+
+
+def mesh_clvoro(layer: float) -> Mesher:
     """Return a mesher of cells of clvoro, with a layer of prisms on the body or wall that is so thick in units of h."""
 
-    def mesh(case: Case, adapter: clvoro.Adapter, solid: clvoro.Solid, n: int) -> None:
-        h = (solid.measure / n) ** (1 / 3)
+    def mesh(case: Case, adapter: clvoro.Adapter, solid: clvoro.Solid, h: float, graded: bool) -> int:
         walls = [name for name in solid.boundary_names if name in ("body", "wall")]
         layers = clvoro.Layers(layer * h, edges=walls) if layer else ()
-        adapter.run(solid, h, layers=layers).to_openfoam(case.folder / "constant" / "polyMesh")
+        made = adapter.run(solid, growing(solid, walls, h) if graded else h, layers=layers)
+        made.to_openfoam(case.folder / "constant" / "polyMesh")
+        return len(made.points)
 
     return mesh
 
 
-def mesh_gmsh(dual: bool) -> Callable[..., None]:
+def mesh_gmsh(dual: bool) -> Mesher:
     """Return a mesher of tetrahedra, or of their duals."""
 
-    def mesh(case: Case, _: clvoro.Adapter, solid: clvoro.Solid, n: int) -> None:
-        edge = (1.12 if dual else 2.04) * (solid.measure / n) ** (1 / 3)
-        for _round in range(ROUNDS):
-            nodes, cells = _tetrahedra(case.folder / "mesh.msh", solid, edge)
-            made = nodes if dual else cells
-            if abs(made / n - 1) < 0.03:
-                break
-            edge *= (made / n) ** (1 / 3)
+    def mesh(case: Case, _: clvoro.Adapter, solid: clvoro.Solid, h: float, __: bool) -> int:
+        nodes, cells = _tetrahedra(case.folder / "mesh.msh", solid, (1.12 if dual else 2.04) * h)
         case.run("gmshToFoam", "mesh.msh")
         if dual:
             case.run("polyDualMesh", "30", "-overwrite", "-concaveMultiCells")
+        return nodes if dual else cells
 
     return mesh
+
+
+def mesh_snappy(case: Case, _: clvoro.Adapter, solid: clvoro.Solid, h: float, graded: bool) -> int:
+    """Make cells by snappyHexMesh, with the tutorial's settings for a flange; a box around a body is that of blocks."""
+    corners, known = solid.surface.corners, np.array(solid.boundary_names)[solid.boundary_index[solid.patch]]
+    lower, upper = (np.array(side) for side in (solid.lower, solid.upper))
+    width, level = (2 * h, 2) if graded else (h, 0)
+    if not (around := "body" in known):  # cubes
+        lower -= 1.3 * h
+        upper = lower + h * np.ceil((upper + 1.3 * h - lower) / h)
+    sides: dict[str, str] = {}
+    for k, face in enumerate(("0 4 7 3", "1 2 6 5", "0 1 5 4", "3 7 6 2", "0 3 2 1", "4 5 6 7")):
+        off = np.abs(corners[:, :, k // 2] - (lower, upper)[k % 2][k // 2]).max(axis=1)
+        name = str(known[off.argmin()]) if around else "blocks"
+        sides[name] = sides.get(name, "") + f"({face}) "
+    divided = " ".join(f"{max(1, round(x / width))}" for x in upper - lower)
+    (a, b, c), (d, e, f) = lower.tolist(), upper.tolist()
+    ring = ((a, b), (d, b), (d, e), (a, e))
+    blocks = {
+        "vertices": f"({' '.join(f'({x!r} {y!r} {z!r})' for z in (c, f) for x, y in ring)})",
+        "blocks": f"(hex (0 1 2 3 4 5 6 7) ({divided}) simpleGrading (1 1 1))",
+        "boundary": f"({''.join(text_of({n: {'type': 'patch', 'faces': f'({s})'}}) for n, s in sides.items())})",
+    }
+    walls = sorted(set(known.tolist()) - set(sides))
+    (folder := case.folder / "constant" / "triSurface").mkdir(parents=True, exist_ok=True)
+    for name, part in (*((name, known == name) for name in walls), ("all", np.isin(known, walls))):
+        _write_stl(folder / f"{name}.stl", corners[part])
+    some = random_points(solid, 500)
+    inside = some[solid.boundary_distance(some).argmax()]
+    controls = {
+        **{"maxLocalCells": 10**7, "maxGlobalCells": 10**7, "minRefinementCells": 0, "resolveFeatureAngle": 30},
+        **{"nCellsBetweenLevels": 3, "allowFreeStandingZoneFaces": "true", "refinementRegions": {}},
+        "features": f'({{ file "all.eMesh"; level {level}; }})',
+        "refinementSurfaces": {name: {"level": f"({level} {level})"} for name in walls},
+        "locationInMesh": f"({' '.join(map(repr, inside.tolist()))})",
+    }
+    edges = {"extractionMethod": "extractFromSurface", "includedAngle": 150}
+    files = {
+        f'#include "{TUTORIALS.parents[1]}/mesh/snappyHexMesh/flange/system/snappyHexMeshDict"\n'
+        "#remove (geometry castellatedMeshControls)\n//": "",
+        "geometry": {f"{name}.stl": {"type": "triSurfaceMesh", "name": name} for name in walls},
+        "castellatedMeshControls": controls,
+    }
+    case.write("system/blockMeshDict", blocks)
+    case.write("system/surfaceFeatureExtractDict", {"all.stl": edges})
+    case.write("system/snappyHexMeshDict", files)
+    for program in ("blockMesh", "surfaceFeatureExtract", "snappyHexMesh -overwrite"):
+        case.run(*program.split())
+    return len(Mesh.of(case.folder))
+
+
+def _write_stl(path: Path, corners: np.ndarray) -> None:
+    """Write triangles (t, 3, 3)."""
+    vertices = ("".join(f"vertex {x!r} {y!r} {z!r}\n" for x, y, z in three) for three in corners.tolist())
+    facets = (f"facet normal 0 0 0\nouter loop\n{three}endloop\nendfacet\n" for three in vertices)
+    path.write_text(f"solid a\n{''.join(facets)}endsolid a\n")
 
 
 def _tetrahedra(path: Path, solid: clvoro.Solid, edge: float) -> tuple[int, int]:
@@ -105,11 +185,7 @@ def _tetrahedra(path: Path, solid: clvoro.Solid, edge: float) -> tuple[int, int]
 
     surface, names_of = solid.surface, np.array(solid.boundary_names)[solid.boundary_index][solid.patch]
     stl = path.with_suffix(".stl")
-    lines = ["solid a"]
-    for corners in surface.vertices[surface.triangles].tolist():
-        vertices = "".join(f"vertex {x!r} {y!r} {z!r}\n" for x, y, z in corners)
-        lines.append(f"facet normal 0 0 0\nouter loop\n{vertices}endloop\nendfacet")
-    stl.write_text("\n".join([*lines, "endsolid a", ""]))
+    _write_stl(stl, surface.corners)
     gmsh.initialize(interruptible=False)
     try:
         for name, value in {
@@ -144,9 +220,10 @@ def _tetrahedra(path: Path, solid: clvoro.Solid, edge: float) -> tuple[int, int]
         gmsh.finalize()
 
 
-MESHERS: dict[str, Callable[..., None]] = {
+MESHERS: dict[str, Mesher] = {
     "clvoro": mesh_clvoro(0),
     "clvoro-layer": mesh_clvoro(0.5),
+    "snappyHexMesh": mesh_snappy,
     "polyDualMesh": mesh_gmsh(True),
     "tetrahedra": mesh_gmsh(False),
 }
@@ -224,18 +301,58 @@ def flow_through_bend(case: Case, mesh: Mesh, reference: dict[str, Any]) -> dict
     }
 
 
+def conduct(case: Case, mesh: Mesh, _: Any) -> dict[str, float]:
+    """Solve for a temperature that is known; return errors."""
+    centers, scale = mesh.faces[0], 4 / np.ptp(mesh.centroids, axis=0).max()
+
+    def exact(points: np.ndarray) -> np.ndarray:
+        """Return the temperature and its gradient, (n, 4)."""
+        x, y, z = scale * points.T
+        wave, other = np.exp(x) * np.cos(y), np.exp(x) * np.sin(y)
+        return np.column_stack([wave + z * y, scale * wave, scale * (z - other), scale * y])
+
+    walls = {p.name: {"type": "fixedValue", "value": nonuniform(exact(centers[p.faces])[:, 0])} for p in mesh.patches}
+    start = {"dimensions": "[0 0 0 1 0 0 0]", "internalField": "uniform 0", "boundaryField": walls}
+    case.write("0/T", start, "volScalarField")
+    case.run("laplacianFoam")
+    case.run("postProcess", "-func", "grad(T)", "-latestTime")
+    found = np.column_stack([case.field(name, len(mesh)) for name in ("T", "grad(T)")])
+    right = exact(mesh.centroids)
+    off, volumes = found - right, mesh.volumes / mesh.volumes.sum()
+    slope = [math.sqrt(volumes @ (v[:, 1:] ** 2).sum(axis=1)) for v in (off, right)]
+    return {"error": math.sqrt(volumes @ off[:, 0] ** 2) / float(right[:, 0].std()), "at wall": slope[0] / slope[1]}
+
+
+def flow_around_bike(case: Case, mesh: Mesh, _: Any) -> dict[str, float]:
+    """Solve; return the drag of the pressure."""
+    closed, slip = {"type": "zeroGradient"}, {"type": "slip"}
+    stream, zero = ({"type": "fixedValue", "value": f"uniform {value}"} for value in ("(1 0 0)", "0"))
+    case.write_start(
+        {"inlet": stream, "outlet": closed, "sides": slip, "body": {"type": "noSlip"}},
+        {"inlet": closed, "outlet": zero, "sides": slip, "body": closed},
+        ("uniform (1 0 0)", "uniform 0"),
+    )
+    case.run("simpleFoam")
+    body = mesh.patch("body")
+    return {"error": 2 * float(case.field("p", len(mesh))[mesh.owner[body], 0] @ mesh.faces[1][body, 0])}
+
+
 def write_system(case: Case) -> None:
     """Write the dictionaries that all programs read."""
     exact = {"solver": "GAMG", "smoother": "GaussSeidel", "tolerance": 1e-11, "relTol": 1e-3}
     solvers = {
         "Phi": {**exact, "relTol": 0},
-        "p": {**exact, "relTol": 0.05},
+        **{name: {**exact, "relTol": 0.05} for name in "pT"},
         "U": {"solver": "PBiCGStab", "preconditioner": "DILU", "tolerance": 1e-11, "relTol": 0.05},
     }
     solution = {
         "solvers": solvers,
         "potentialFlow": {"nNonOrthogonalCorrectors": 20, "PhiRefCell": 0, "PhiRefValue": 0},
-        "SIMPLE": {"consistent": "yes", "nNonOrthogonalCorrectors": 1, "residualControl": {"p": 1e-5, "U": 1e-6}},
+        "SIMPLE": {
+            "consistent": "yes",
+            "nNonOrthogonalCorrectors": 1,
+            "residualControl": {"p": 1e-5, "U": 1e-6, "T": 1e-8},
+        },
     }
     case.write_system(
         2 * RADIUS / REYNOLDS,
@@ -248,17 +365,20 @@ def write_system(case: Case) -> None:
 
 @dataclass(frozen=True)
 class Flow:
-    """A solid, its flow, and what the second error is."""
+    """A solid, and its flow or conduction, perhaps measured against a reference, or on graded cells."""
 
     solid: Callable[[], clvoro.Solid]
     solve: Callable[..., dict[str, float]]
-    second: str
-    has_reference: bool
+    has_reference: bool = False
+    graded: bool = False
 
 
 FLOWS = {
-    "sphere": Flow(around_sphere, flow_around_sphere, "velocity at the sphere", False),
-    "bend": Flow(bent_pipe, flow_through_bend, "loss of pressure", True),
+    "sphere": Flow(around_sphere, flow_around_sphere),
+    "bend": Flow(bent_pipe, flow_through_bend, has_reference=True),
+    "bracket": Flow(lambda: solid_of(SHAPES["bracket"][0](), group_names=["wall"]), conduct),
+    "flange": Flow(flange, conduct),
+    "motorBike": Flow(around_bike, flow_around_bike, graded=True),
 }
 COLUMNS = {
     "flow": lambda r: r["flow"],
@@ -267,10 +387,13 @@ COLUMNS = {
     "mesh, s": lambda r: f"{r['seconds']:.1f}",
     "non-orth. max, mean": lambda r: f"{r['non_orthogonality']:.1f}, {r['mean_non_orthogonality']:.2f}",
     "skewness": lambda r: f"{r['skewness']:.2f}",
+    "concave": lambda r: f"{r['concave']:.0f}",
+    "off / h": lambda r: f"{r['off']:.3f}",
     "checkMesh": lambda r: "OK" if r["ok"] else r["complaints"],
+    "iterations": lambda r: r["iterations"] or "",
     "error": lambda r: f"{r['error']:.4f}",
-    "second error": lambda r: f"{r['at wall']:.4f}",
-    "by exact fluxes": lambda r: f"{r.get('by exact fluxes', math.nan):.4f}",
+    "second error": shown("at wall", ".4f"),
+    "by exact fluxes": shown("by exact fluxes", ".4f"),
 }
 
 
@@ -281,15 +404,25 @@ def processor_time() -> float:
 
 
 def measure(case: Case, adapter: clvoro.Adapter, flow: Flow, mesher: str, n: int, reference: Any) -> dict[str, Any]:
-    """Make a mesh, check it, solve the flow; return a row."""
+    """Make meshes until one has about `n` cells, check it, solve the flow; return a row."""
     write_system(case)
     solid = flow.solid()
-    begin = processor_time()
-    MESHERS[mesher](case, adapter, solid, n)
-    seconds = processor_time() - begin
+    h = (solid.measure / n) ** (1 / 3)
+    for _ in range(ROUNDS):
+        begin = processor_time()
+        made = MESHERS[mesher](case, adapter, solid, h, flow.graded)
+        seconds = processor_time() - begin
+        if abs(made / n - 1) < 0.03:
+            break
+        h *= (made / n) ** (1 / 3)
     mesh = Mesh.of(case.folder)
-    row = {"cells": len(mesh.volumes), "seconds": seconds, **flow.solve(case, mesh, reference)}
-    return {**row, **figures_of(check_case(case.folder))}
+    row = {"cells": len(mesh), "seconds": seconds, **flow.solve(case, mesh, reference)}
+    text = "".join(path.read_text() for path in case.folder.glob("log.*Foam"))
+    ended = re.search(r"converged in (\d+) iterations", text)
+    wall = np.concatenate([p.faces for p in mesh.patches if p.name not in ("far", "inlet", "outlet", "sides")])
+    at = np.unique(np.concatenate([mesh.corners[mesh.starts[f] : mesh.starts[f + 1]] for f in wall]))
+    off = float(solid.boundary_distance(mesh.points[at]).max()) / (solid.measure / len(mesh)) ** (1 / 3)
+    return {**row, "off": off, "iterations": ended and ended[1], **figures_of(check_case(case.folder))}
 
 
 def main() -> None:
@@ -307,7 +440,8 @@ def main() -> None:
         folder = options.keep or Path(temporary)
         for name in names(options.flows):
             flow, reference = FLOWS[name], {}
-            rows = [(mesher, n) for n in counts(options.cells) for mesher in names(options.meshers)]
+            able = ("clvoro", "snappyHexMesh") if flow.graded else MESHERS
+            rows = [(m, n) for n in counts(options.cells) for m in names(options.meshers) if m in able]
             if flow.has_reference:
                 rows.insert(0, ("clvoro", options.reference))
             for mesher, n in rows:

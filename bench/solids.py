@@ -43,6 +43,7 @@ import time
 import traceback
 import warnings
 from collections.abc import Callable, Iterable
+from functools import partial
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -75,7 +76,10 @@ COLUMNS = {
     "checkMesh": PLANE_COLUMNS["checkMesh"],
 }
 
-
+Made = tuple[Any, Any, dict[str, Any], Callable[[clvoro.Result, Path], dict[str, Any]]]
+"""A domain, its sizes, settings of the run, and a function for more figures."""
+Job = tuple[dict[str, Any], Callable[[], Made]]
+"""What a row begins with, and how the rest is made."""
 GOALS = {"non_orthogonality": 20, "mean_non_orthogonality": 3, "skewness": 2, "concave": 0}
 """Largest figures of a mesh that is as wanted."""
 WORST_COLUMNS = {
@@ -136,11 +140,13 @@ def measure(adapter: clvoro.Adapter, solid: clvoro.Solid, size: Any, case: Path,
 
 
 def draw(result: clvoro.Result, path: Path, title: str) -> None:
-    """Draw the mesh, cut open, with the patches in colors."""
+    """Draw the mesh, cut open, with the patches or the regions in colors."""
     from clvoro.plotting.solids import plot_cutaway
 
     path.parent.mkdir(parents=True, exist_ok=True)
-    plot_cutaway(result, "quality", walls=True, title=title).savefig(path, dpi=150, bbox_inches="tight")
+    regions = result.diagram.cell_region if len(result.diagram.region_names) else None
+    figure = plot_cutaway(result, "quality" if regions is None else regions, walls=regions is None, title=title)
+    figure.savefig(path, dpi=150, bbox_inches="tight")
 
 
 BOOLEAN_COLUMNS = {
@@ -222,7 +228,7 @@ def _serve(jobs: Any, options: argparse.Namespace) -> None:
         jobs.send(measure_boolean(adapter, job, options.cells))
 
 
-def measure_booleans(_: clvoro.Adapter, options: argparse.Namespace, report: Report) -> str:
+def measure_booleans(options: argparse.Namespace, report: Report) -> str:
     """Add a row for each random solid or file, and return how many have each verdict."""
     context, worker, pipe = multiprocessing.get_context("spawn"), None, None
     jobs: dict[Any, Any] = {
@@ -267,49 +273,36 @@ LAYER_COLUMNS = {
     "first height": lambda r: f"{r['first']:.3f}",
     **{name: COLUMNS[name] for name in ("non-orth. max, mean", "skewness", "volume")},
     "aspect": lambda r: f"{r['aspect']:.0f}",
-    "checkMesh": lambda r: "Mesh OK" if r["plain"] else r["why"],
+    "checkMesh": lambda r: "Mesh OK" if r.get("plain") else r.get("why", ""),
     "with -allGeometry": PLANE_COLUMNS["checkMesh"],
 }
 
 
-def measure_layers(adapter: clvoro.Adapter, options: argparse.Namespace, report: Report) -> str:
-    """Add a row for each solid with layers on all patches, and return how many meshes `checkMesh` accepts."""
+def layered(options: argparse.Namespace) -> Iterable[Job]:
+    """Return the solids with layers on all patches."""
+
+    def made(name: str, h: float, given: str) -> Made:
+        thickness, count, growth = (float(x) for x in given.split(":"))
+        layers = clvoro.Layers(thickness * h / (growth ** np.arange(int(count))).sum(), int(count), growth)
+        solid = solid_of(LAYERED[name][0](), repair=name == "dirty")
+        return solid, h, {"layers": layers}, partial(reached, layers=layers)
+
     for name, level, given in product(
         names(options.only) or LAYERED, names(options.resolutions), names(options.layers)
     ):
-        make, sizes = LAYERED[name]
-        h = sizes[int(level)]
-        thickness, count, growth = (float(x) for x in given.split(":"))
-        first = thickness * h / (growth ** np.arange(int(count))).sum()
-        layers = clvoro.Layers(first, int(count), growth)
-        row: dict[str, Any] = {"solid": name, "h": h, "layers": given, **dict.fromkeys(_EMPTY, float("nan"))}
-        row |= dict.fromkeys(("thickness", "full", "first", "aspect", "inner"), float("nan")) | {
-            "prisms": 0,
-            "plain": False,
-        }
-        with tempfile.TemporaryDirectory() as folder:
-            case = Path(folder) if options.keep is None else options.keep / f"{name}-{h:g}-{given}".replace(" ", "-")
-            try:
-                row |= measure(adapter, solid_of(make(), repair=name == "dirty"), h, case, layers=layers)
-                verdict = check_case(case, thorough=False)
-                row |= {"plain": verdict.ok, "why": "; ".join(verdict.complaints)} | reached(row["result"], layers)
-                if options.pictures is not None:
-                    draw(row["result"], options.pictures / f"{name}-{h:g}-{given}.png", f"{name}, layers {given}")
-            except ClvoroError as error:
-                row |= {"ok": False, "cells": 0, "complaints": "", "why": f"{type(error).__name__}: {error}"}
-        row.pop("result", None)
-        report.add(row, f"{name}, {h:g}, {given}: {'OK' if row['plain'] else row['why']}")
-    good = sum(row["plain"] for row in report.records)
-    return f"{good} of {len(report.records)} meshes with layers pass checkMesh"
+        h = LAYERED[name][1][int(level)]
+        yield {"solid": name, "h": h, "layers": given}, partial(made, name, h, given)
 
 
-def reached(result: clvoro.Result, layers: clvoro.Layers) -> dict[str, float]:
-    """Return how thick layers are, as the run says it, and the heights of first prisms, their volumes over areas."""
-    d, f = result.diagram, result.diagram.faces
+def reached(result: clvoro.Result, case: Path, layers: clvoro.Layers) -> dict[str, Any]:
+    """Return how thick layers are, the heights of first prisms, and what `checkMesh` says without its options."""
+    d, f, verdict = result.diagram, result.diagram.faces, check_case(case, thorough=False)
     walls = f.n_inner + np.flatnonzero(d.layer[f.owner[f.n_inner :]] == 1)
     first = d.volumes[f.owner[walls]] / f.area[walls] / layers.height
     (told,) = result.settings["thickness"]
     return {
+        "plain": verdict.ok,
+        "why": "; ".join(verdict.complaints),
         "prisms": int((d.layer > 0).sum()),
         "inner": float(np.abs(result.size_error[d.layer == 0]).mean()),
         "thickness": told["mean"] / told["asked"],
@@ -327,29 +320,60 @@ SURFACE_COLUMNS = {
 }
 
 
-def measure_surfaces(adapter: clvoro.Adapter, options: argparse.Namespace, report: Report) -> str:
-    """Add a row for each domain with surfaces inside, and return how many meshes `checkMesh` accepts."""
+def divided(options: argparse.Namespace) -> Iterable[Job]:
+    """Return the domains with surfaces inside."""
+
+    def volumes_of(result: clvoro.Result, case: Path, known: dict[str, float]) -> dict[str, Any]:
+        d = result.diagram
+        found = dict(zip(d.region_names, np.bincount(d.cell_region, d.volumes), strict=True))
+        off = [abs(found[region] / volume - 1) for region, volume in known.items()]
+        return {"regions": len(found), "off": max(off, default=float("nan"))}
+
+    def made(name: str, run: str) -> Made:
+        domain, size, known = SCENES[name]()
+        return domain, size, settings_of(run), partial(volumes_of, known=known)
+
     for name, run in product(names(options.only) or SCENES, names(options.runs)):
-        row: dict[str, Any] = {"solid": name, "run": run, "regions": 0, "off": float("nan")}
-        row |= dict.fromkeys(_EMPTY, float("nan"))
-        try:
-            domain, size, volumes = SCENES[name]()
-            with tempfile.TemporaryDirectory() as folder:
-                row |= measure(adapter, domain, size, Path(folder), **settings_of(run))
-            d = row["result"].diagram
-            found = dict(zip(d.region_names, np.bincount(d.cell_region, d.volumes), strict=True))
-            off = [abs(found[region] / volume - 1) for region, volume in volumes.items()]
-            row |= {"regions": len(found), "off": max(off, default=float("nan"))}
-            if options.pictures is not None:
-                options.pictures.mkdir(parents=True, exist_ok=True)
-                figure = row["result"].plot(d.cell_region, view="cutaway", title=name)
-                figure.savefig(options.pictures / f"{name}.png", dpi=150, bbox_inches="tight")
-        except ClvoroError as error:
-            row |= {"ok": False, "cells": 0, "complaints": f"{type(error).__name__}: {error}"}
+        yield {"solid": name, "run": run}, partial(made, name, run)
+
+
+def uniform(options: argparse.Namespace) -> Iterable[Job]:
+    """Return the solids at uniform sizes, or at sizes that grow from their walls."""
+
+    def made(name: str, run: str, h: float, seed: int) -> Made:
+        solid = solid_of(SHAPES[name][0](), repair=name == "dirty")
+        size = growing(solid, solid.boundary_names, h) if options.graded else h
+        return solid, size, {**settings_of(run), "seed": seed}, lambda result, case: {}
+
+    for name, level, run, seed in product(
+        names(options.only) or SHAPES, names(options.resolutions), names(options.runs), range(options.seeds)
+    ):
+        h = SHAPES[name][1][int(level)]
+        yield {"solid": name, "run": run, "h": h, "seed": seed}, partial(made, name, run, h, seed)
+
+
+def measure_all(adapter: clvoro.Adapter, options: argparse.Namespace, report: Report, jobs: Iterable[Job]) -> str:
+    """Add a row for each of `jobs`, and return how many meshes `checkMesh` accepts."""
+    for begin, make in jobs:
+        label = "-".join(map(str, begin.values())).replace(" ", "-")
+        row: dict[str, Any] = {**dict.fromkeys(_EMPTY, float("nan")), "prisms": 0, "regions": 0, **begin}
+        with tempfile.TemporaryDirectory() as folder:
+            case = Path(folder) if options.keep is None else options.keep / label
+            try:
+                domain, size, settings, more = make()
+                row |= measure(adapter, domain, size, case, **settings)
+                row |= more(row["result"], case)
+                if options.pictures is not None:
+                    draw(row["result"], options.pictures / f"{label}.png", label)
+            except Exception as error:  # what must never happen is a row, too
+                known = isinstance(error, ClvoroError)
+                what = f"{type(error).__name__}: {error}" if known else traceback.format_exc(limit=-1)[-100:]
+                row |= {"ok": False, "cells": 0, "complaints": what}
         row.pop("result", None)
-        report.add(row, f"{name}, {run}: {'OK' if row['ok'] else row['complaints']}")
-    good = sum(row["ok"] for row in report.records)
-    return f"{good} of {len(report.records)} meshes with surfaces inside pass checkMesh"
+        what = f"OK {COLUMNS['non-orth. max, mean'](row)}, {row['skewness']:.2f}, {row['seconds']:.0f} s"
+        report.add(row, f"{label}: {what if row['ok'] else row['complaints']}")
+    good = sum(row.get("plain", row["ok"]) for row in report.records)
+    return f"{good} of {len(report.records)} meshes pass checkMesh"
 
 
 SPEED_COLUMNS = {
@@ -407,7 +431,7 @@ def measure_speed(adapter: clvoro.Adapter, n: int, chosen: list[str], report: Re
 
 ORDER_COLUMNS = {
     **{name: COLUMNS[name] for name in ("solid", "run", "h", "cells", "mean e", "quotient")},
-    "volume error": lambda r: f"{r['volume']:.1e}",
+    "volume error": lambda r: f"{r['volume'] - 1:.1e}",
     "area error": lambda r: f"{r['area']:.1e}",
     "distance / h^2 kappa": lambda r: f"{r['distance']:.2e}",
 }
@@ -419,27 +443,23 @@ SMOOTH = {
 """Solids, by the length of triangles, and their curvatures."""
 
 
-def measure_order(adapter: clvoro.Adapter, sizes: list[float], runs: list[str], report: Report) -> None:
-    """Add rows of errors of volume and wall area, and the largest distance of vertices of walls from the surface."""
-    for name, (make, curvature) in SMOOTH.items():
+def smooth(options: argparse.Namespace) -> Iterable[Job]:
+    """Return smooth solids, for errors of volume and wall area, and distances of vertices of walls from the surface."""
+    sizes = [float(h) for h in names(options.order)]
+
+    def errors_of(result: clvoro.Result, case: Path, solid: clvoro.Solid, unit: float) -> dict[str, Any]:
+        f = result.diagram.faces
+        walls = np.unique(f.corners[f.starts[f.n_inner] :])
+        area = float(f.area[f.n_inner :].sum() / solid.boundary_measure - 1)
+        return {"area": area, "distance": float(solid.boundary_distance(f.points[walls]).max() / unit)}
+
+    def made(name: str, run: str, h: float) -> Made:
+        make, curvature = SMOOTH[name]
         solid = make(min(sizes) / 3)
-        for run in runs:
-            for h in sizes:
-                d = (result := adapter.run(solid, h, **settings_of(run))).diagram
-                f = d.faces
-                walls = np.unique(f.corners[f.starts[f.n_inner] :])
-                row = {
-                    "solid": name,
-                    "run": run,
-                    "h": h,
-                    "cells": len(d),
-                    "error": float(np.abs(result.size_error).mean()),
-                    "quotient": quotient(d),
-                    "volume": float(d.volumes.sum() / solid.measure - 1),
-                    "area": float(f.area[f.n_inner :].sum() / solid.boundary_measure - 1),
-                    "distance": float(solid.boundary_distance(f.points[walls]).max() / (h**2 * curvature)),
-                }
-                report.add(row, f"{name}, {run}, {h:g}: {row['volume']:.1e}")
+        return solid, h, settings_of(run), partial(errors_of, solid=solid, unit=h**2 * curvature)
+
+    for name, run, h in product(SMOOTH, names(options.runs), sizes):
+        yield {"solid": name, "run": run, "h": h}, partial(made, name, run, h)
 
 
 def settings_of(run: str) -> dict[str, Any]:
@@ -482,10 +502,6 @@ def main() -> None:
     ):
         if unknown := [name for name in given if name not in known]:
             options_of.error(f"no {what} {', '.join(unknown)}; there are {', '.join(known)}")
-    if options.order:
-        adapter, report = make_adapter(options), Report(options.json, ORDER_COLUMNS)
-        measure_order(adapter, [float(h) for h in names(options.order)], names(options.runs), report)
-        return report.finish(heading(adapter, "errors of meshes against the surface"))
     if options.speed:
         adapter, report = make_adapter(options), Report(options.json, SPEED_COLUMNS)
         for n in names(options.speed):
@@ -493,46 +509,32 @@ def main() -> None:
         return report.finish(heading(adapter, "processor time of runs, and of meshes that are read with their faces"))
     require("checkMesh")
     adapter = make_adapter(options)
-    for chosen, columns, measured in (
-        (options.booleans or options.files, BOOLEAN_COLUMNS, measure_booleans),
-        (options.surfaces, SURFACE_COLUMNS, measure_surfaces),
-        (options.layers, LAYER_COLUMNS, measure_layers),
-    ):
-        if chosen:
-            report = Report(options.json, columns)
-            return report.finish(heading(adapter, measured(adapter, options, report)))
-    report = Report(options.json, WORST_COLUMNS if options.worst else COLUMNS)
-    every = product(
-        names(options.only) or SHAPES, names(options.resolutions), names(options.runs), range(options.seeds)
+    if options.booleans or options.files:
+        report = Report(options.json, BOOLEAN_COLUMNS)
+        return report.finish(heading(adapter, measure_booleans(options, report)))
+    columns, jobs = next(
+        (columns, jobs)
+        for chosen, columns, jobs in (
+            (options.order, ORDER_COLUMNS, smooth),
+            (options.surfaces, SURFACE_COLUMNS, divided),
+            (options.layers, LAYER_COLUMNS, layered),
+            (options.worst, WORST_COLUMNS, uniform),
+            (True, COLUMNS, uniform),
+        )
+        if chosen
     )
-    for name, level, run, seed in every:
-        make, sizes = SHAPES[name]
-        h = sizes[int(level)]
-        label = f"{name}-{run}-{h:g}-{seed}".replace(" ", "-")
-        row: dict[str, Any] = {"solid": name, "run": run, "h": h, **dict.fromkeys(_EMPTY, float("nan"))}
-        with tempfile.TemporaryDirectory() as folder:
-            case = Path(folder) if options.keep is None else options.keep / label
-            try:
-                solid = solid_of(make(), repair=name == "dirty")
-                size = growing(solid, solid.boundary_names, h) if options.graded else h
-                row |= measure(adapter, solid, size, case, **settings_of(run), seed=seed)
-                if options.pictures is not None:
-                    draw(row["result"], options.pictures / f"{label}.png", f"{name}, h = {h:g}")
-            except ClvoroError as error:
-                row |= {"ok": False, "cells": 0, "complaints": f"{type(error).__name__}: {error}"}
-            except Exception:  # what must never happen is a row, too
-                row |= {"ok": False, "cells": 0, "complaints": traceback.format_exc(limit=-1)[-100:]}
-        row.pop("result", None)
-        what = f"OK {COLUMNS['non-orth. max, mean'](row)}, {row['skewness']:.2f}, {row['seconds']:.0f} s"
-        report.add(row, f"{label}: {what if row['ok'] else row['complaints']}")
-    title = f"{sum(row['ok'] for row in report.records)} of {len(report.records)} meshes pass checkMesh"
+    report = Report(options.json, columns)
+    title = measure_all(adapter, options, report, jobs(options))
     if options.worst:
         report.records = worst_of(report.records)
         title += f", {sum(row['good'] for row in report.records)} meet the goals"
     report.finish(heading(adapter, title))
 
 
-_EMPTY = "seconds error quotient non_orthogonality mean_non_orthogonality skewness concave volume".split()
+_EMPTY = (
+    *("seconds", "error", "quotient", "non_orthogonality", "mean_non_orthogonality", "skewness", "concave", "volume"),
+    *("thickness", "full", "first", "aspect", "inner", "off", "area", "distance"),
+)
 
 
 if __name__ == "__main__":

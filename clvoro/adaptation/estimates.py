@@ -153,17 +153,15 @@ def check_memory(
     name, available = device.name.strip(), available_memory(device)
     own = n if engine.peers.count == 1 else cells_of_part(n, engine.cell_dim, engine.peers.count)
     needed = estimate_memory(engine, own, domain, extras, run=run, power=power, exact=exact)
+    hint = domain.unit_hint if domain else ""
+    unit = f"Do h and the domain have the same unit of length?{hint} If so, use "
     if own > MAX_CELLS or n > MAX_LABELS:
         raise MemoryLimitError(
             f"the run has {n:.3g} cells, expected at most {MAX_CELLS:.3g}, the limit of 32-bit indices (they need "
-            f"{in_bytes(needed)}, and the device has {in_bytes(available)}). Do h and the domain have the same unit "
-            "of length? If so, use a larger size or a smaller n_cells"
+            f"{in_bytes(needed)}, and the device has {in_bytes(available)}). {unit}a larger size or a smaller n_cells"
         )
     largest, most = LARGEST * (needed - FIXED), memory_limits.largest_allocation(device)
-    remedy = (
-        "Do h and the domain have the same unit of length? If so, use a larger size, n_cells, dtype='float32' or "
-        "another device"
-    )
+    remedy = f"{unit}a larger size, n_cells, dtype='float32' or another device"
     remedy += " for each part of the mesh, or more ranks or devices" * engine.peers.shared
     if needed > available:
         raise MemoryLimitError(

@@ -415,10 +415,13 @@ class Job:
 
     def _initial(self, adapter: Any, size: Any, main: Result) -> Result | None:
         """Return the mesh before the first step."""
+        domain = self.case.domain
         if main.initial is None or main.history["level"][0] > 0:
             return None  # there was no step, or the first level was not the finest
-        points = np.clip(main.initial.points, self.case.domain.lower, self.case.domain.upper)
-        return adapter.run(self.case.domain, size, points=points, method="lloyd", max_steps=0)
+        if domain.curved_walls or domain.sheets is not None:
+            return None  # walls of so irregular cells take longer than the run
+        points = np.clip(main.initial.points, domain.lower, domain.upper)
+        return adapter.run(domain, size, points=points, method="lloyd", max_steps=0)
 
     def _check_for_solver(self, results: dict[str, Result]) -> None:
         """Check the main mesh by the criteria of the solver; its own program has the last word."""

@@ -225,9 +225,10 @@ def load_case(name: str | Path) -> Case:
         return Case.from_toml(known[str(name)], str(name))
     path = Path(name)
     if key := GEOMETRIES.get(path.suffix.lower()):
+        unit = "; for sizes in meters, add units = 'mm' if the file is in millimeters" * (key == "solid")
         raise InputError(
             f"{str(name)!r} is a geometry, expected a case: write a file .toml with {key} = {path.name!r} below "
-            "[domain], and a table [size]; `clvoro cases lake` prints one to start from"
+            f"[domain], and above that a line with the width of cells, such as size = 0.1{unit}"
         )
     try:
         text = read_text(path, LONGEST)

@@ -364,6 +364,11 @@ class Solid(Domain):
         """Pairs of patches that meet at creases, (k, 2) int."""
         return self.creases.patches
 
+    @property
+    def unit_hint(self) -> str:  # type: ignore[override]
+        """How long the solid is, and how to say the unit of a file."""
+        return f" (The solid is {max(self.extent):.3g} long; units='mm' says that a file is in millimeters.)"
+
     # Where points are.
 
     @cached_property
