@@ -8,10 +8,11 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from os import PathLike
-from typing import TYPE_CHECKING, Literal, NoReturn
+from typing import Literal, NoReturn
 
 import numpy as np
 import pyopencl as cl
+from numpy.typing import ArrayLike, DTypeLike
 
 from .adaptation.estimates import check_memory
 from .adaptation.options import (
@@ -41,9 +42,6 @@ from .opencl.prebuild import BuildNotice, renew, report_builds
 from .opencl.probe import check_process
 from .opencl.threads import Team, Threads
 from .tessellation.readback.diagram import make_diagram
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike, DTypeLike
 
 
 class Adapter:

@@ -8,9 +8,10 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import partial
 from numbers import Real
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ..arguments import (
     check_callable,
@@ -27,9 +28,6 @@ from ..geometry.boundary_layers import Layers
 from ..geometry.domain import Domain
 from .fixed_points import check_fixed
 from .methods import MOVING, PUBLISHED
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
 
 MethodName = Literal[
     "adaptive",

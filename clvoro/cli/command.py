@@ -15,17 +15,15 @@ from contextlib import contextmanager, nullcontext, redirect_stderr, redirect_st
 from dataclasses import fields
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from ..errors import Aborted, BuildError, ClvoroError, DeviceError, InputError, InputTypeError, OutputError
+from ..geometry.boundary_layers import Layers
 from ..opencl.peers import ALONE
 from ..version import __version__
 from .outputs import MESH_FILES, NAMES
 from .progress import steady_streams
 from .ranks import end_together, may_speak, this_rank
-
-if TYPE_CHECKING:
-    from ..geometry.boundary_layers import Layers
 
 OK, FAILED, BAD_INPUT, NO_DEVICE, INTERRUPTED = 0, 1, 2, 3, 130
 

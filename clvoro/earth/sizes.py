@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 import shapely
+from numpy.typing import ArrayLike
 
 from ..arguments import check_number, warn
 from ..errors import InputError, InputTypeError, MismatchWarning
@@ -16,18 +16,13 @@ from ..geometry.domain import Domain
 from ..geometry.shapes import Circle
 from ..geometry.sphere import DEGREES, Sphere, directions
 from ..sizing.arguments import check_positive, check_slope
+from ..sizing.codegen import CodeWriter
 from ..sizing.distance import Distance
 from ..sizing.field import Combined, Field, Scaled, as_field, on_domain
 from ..sizing.graded import Graded
 from ..sizing.raster import Raster
 from ..sizing.region import Region, inside_code, ring_edges
 from .shapes import area_of, check_lonlat, warn_of_radians
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
-
-    from ..geometry.domain import Domain
-    from ..sizing.codegen import CodeWriter
 
 
 class ArcGraded(Field):

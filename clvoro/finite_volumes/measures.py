@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ..mesh.connectivity import following, slices, take_rows
+from ..mesh.faces import Faces
 from ..mesh.geometry import Geometry, cell_geometry, cross_columns, dots, lengths, polygon_sides, smaller_size, sum_rows
 from ..mesh.straightening import cross
 from .defects import concave_pairs
 from .prisms import polyhedra
-
-if TYPE_CHECKING:
-    from ..mesh.faces import Faces
 
 PLANAR_COSINE = 1e-6
 """Least distance of the center of a face from the plane of another face of its cell, over the distance of both centers;

@@ -5,13 +5,14 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy
 
+from ..adapter import Adapter
 from ..errors import InputError
 from ..geometry.box import Box
+from ..io.foam_read import FoamPatchFaces
 from ..mesh.diagram import Diagram
 from ..mesh.geometry import sum_rows
 from ..remapping.cell_data import conserved
@@ -19,11 +20,6 @@ from ..sizing.graded import default_engine
 from ..solvers.poisson import Laplacian, Poisson
 from .fields import WIDTHS, Entries, FoamField, Values
 from .mesh import FoamMesh
-
-if TYPE_CHECKING:
-    from ..adapter import Adapter
-    from ..io.foam_read import FoamPatchFaces
-
 
 MOST_DIVERGENCE = 1e-10
 """Largest sum of the fluxes out of a cell, over the mean flux through a face."""

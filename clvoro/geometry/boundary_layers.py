@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, cast
+from typing import cast
 
 import numpy as np
 import scipy
@@ -18,10 +18,8 @@ from .box import Box
 from .domain import Domain
 from .layer_columns import count_columns, count_fan, find_chains, place_columns, place_fan
 from .polygon import Polygon
-
-if TYPE_CHECKING:
-    from .solid.solid import Solid
-    from .surface import Surface
+from .solid.solid import Solid
+from .surface import Surface
 
 Size = Callable[[np.ndarray], np.ndarray]
 """Target sizes at points (n, d)."""

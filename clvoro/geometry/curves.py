@@ -11,18 +11,16 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any, Literal, ParamSpec
+from typing import Any, Literal, ParamSpec
 
 import numpy as np
 import scipy
+from numpy.typing import ArrayLike
 
 from ..arguments import check_choice, check_integer, check_number, check_rows, format_point
 from ..errors import InputError, InputTypeError
 from .boundary_names import WORD
 from .domain import LARGEST_EDGE
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
 
 
 def angles(a: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
 from weakref import WeakKeyDictionary
 
 import numpy as np
 
-if TYPE_CHECKING:
-    from ..opencl.engine import Engine
-    from ..opencl.workspace import Workspace
+from ..opencl.engine import Engine
+from ..opencl.workspace import Workspace
 
 BINS_PER_EDGE = 4
 LEAST_SIDE, LARGEST_SIDE = 32, 1024

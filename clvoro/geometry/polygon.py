@@ -10,14 +10,14 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from itertools import pairwise
 from os import PathLike
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import shapely
 
 from ..arguments import check_rows, format_point, warn
 from ..errors import InputError, InputTypeError, MismatchWarning
-from ..opencl.engine import Traits
+from ..opencl.engine import Engine, Traits
 from .boundary_names import BoundaryNames, Walls
 from .curves import Curve
 from .domain import Domain
@@ -28,9 +28,6 @@ from .geojson import may_be_degrees, pieces_of_description, pieces_of_geojson, p
 from .rings import REPAIRED, CurvedEdges, OrientedRings, make_rings, project, repaired, signed_area
 from .shapes import Edges
 from .simplification import pieces_of, simplify
-
-if TYPE_CHECKING:
-    from ..opencl.engine import Engine
 
 _MARGIN = 1 / 64
 """Distance from the domain to the box that clips cells, as a share of the bounding box's longest edge."""

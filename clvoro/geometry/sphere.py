@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import Any, NoReturn
 
 import numpy as np
 import scipy
+from numpy.typing import ArrayLike
 
 from ..arguments import check_integer, check_number, check_rows
 from ..errors import InputError
@@ -16,9 +17,6 @@ from ..opencl.engine import Traits
 from .boundary_names import BoundaryNames, Walls
 from .box import Box
 from .domain import LARGEST_EDGE, Chart, Domain
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
 
 DEGREES = Box((-180, -90), (180, 90))
 """All longitudes and latitudes."""

@@ -5,19 +5,17 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import Any, NoReturn
 
 import numpy as np
 import scipy
 
 from ..arguments import check_number, check_rows
 from ..errors import InputError
+from ..opencl.engine import Traits
 from .boundary_names import BoundaryNames, Walls
 from .domain import Domain
 from .sphere import COAST
-
-if TYPE_CHECKING:
-    from ..opencl.engine import Traits
 
 _ROUNDINGS = 64 * float(np.finfo(np.float32).eps)
 """Distance to a generator, over itself, by which a point may be beyond the boundary: that of meshes in float32."""

@@ -4,18 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 from weakref import WeakKeyDictionary
 
 import numpy as np
 import scipy
 
+from ..opencl.engine import Engine
+from ..opencl.workspace import Workspace
 from .bvh import Tree, curve_order
 from .edge_bins import ranges
-
-if TYPE_CHECKING:
-    from ..opencl.engine import Engine
-    from ..opencl.workspace import Workspace
 
 SMOOTH, CONVEX, CONCAVE = 0, 1, 2
 """Kinds of edges and corners of triangles: within a patch, on a convex crease, on a concave one."""

@@ -8,7 +8,9 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+from numpy.typing import ArrayLike
 
 from ..arguments import check_path
 from ..errors import InputError, InputTypeError
@@ -25,9 +27,6 @@ from .npz import write_npz
 from .ugrid import write_ugrid
 from .vtu import write_pvtu, write_vtu
 from .vtu_read import load_vtu
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
 
 __all__ = ["Disv", "DisvBoundary", "check_writable", "load", "make_folder", "save", "write", "write_history"]
 

@@ -5,9 +5,10 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ..arguments import check_cell_values
 from ..errors import InputError, InputTypeError
@@ -15,9 +16,6 @@ from ..geometry.domain import Domain
 from ..mesh.diagram import Diagram
 from ..mesh.results import Result
 from .arrays import FileError
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
 
 _WORD = re.compile(r"[A-Za-z_][A-Za-z0-9_.-]*")
 DOMAIN = " clvoro domain: "

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -11,15 +11,13 @@ from ..errors import InputError
 from ..finite_volumes.criteria import Criterion, Rows, SolverReport
 from ..finite_volumes.gate import LEAST_MEASURE, SOLVERS, around_islands, regions
 from ..finite_volumes.prisms import cell_loops
+from ..finite_volumes.solver_mesh import WallShape
 from ..graphs import first_nodes
 from ..mesh.connectivity import take_rows
+from ..mesh.diagram import Diagram
 from ..mesh.faces import Faces
 from ..mesh.geometry import smaller_size
 from ..mesh.read_only import Sealed
-
-if TYPE_CHECKING:
-    from ..finite_volumes.solver_mesh import WallShape
-    from ..mesh.diagram import Diagram
 
 _EMPTY = 1e-5
 """Length of faces that are left out, over the width of the smaller of their cells."""

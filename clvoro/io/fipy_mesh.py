@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from fipy.meshes.mesh import Mesh
@@ -11,12 +11,10 @@ from fipy.variables.faceVariable import FaceVariable
 
 from ..errors import InputError
 from ..finite_volumes.prisms import cell_loops
+from ..finite_volumes.solver_mesh import WallShape
 from ..mesh.connectivity import take_rows
-
-if TYPE_CHECKING:
-    from ..finite_volumes.solver_mesh import WallShape
-    from ..mesh.diagram import Diagram
-    from ..mesh.faces import Faces
+from ..mesh.diagram import Diagram
+from ..mesh.faces import Faces
 
 
 class _AtGenerators:

@@ -19,10 +19,11 @@ from collections.abc import Iterable, Iterator, Mapping
 from itertools import chain
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, get_args
+from typing import Literal, get_args
 
 import numpy as np
 import orjson
+from numpy.typing import ArrayLike
 
 from ..arguments import check_flag
 from ..errors import InputError, InputTypeError
@@ -36,9 +37,6 @@ from ..mesh.faces import Faces
 from .atomic import atomic_file, atomic_folder, make_folder
 from .contents import DOMAIN, Contents, describe
 from .foam_parts import ADDRESSING, FoamPatch, FoamPiece, decompose, processors_of
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
 
 
 def cyclic_patches(mesh: Faces, apart: bool = False) -> tuple[list[FoamPatch], np.ndarray]:

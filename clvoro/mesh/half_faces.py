@@ -4,17 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ..errors import ClvoroError
 from .connectivity import following
+from .diagram import Diagram
 from .read_only import read_only
-
-if TYPE_CHECKING:
-    from .diagram import Diagram
-
 
 FLAT = 1e-6
 """A face counts as plane if its corners are nearer to a plane than this, over the width of the cell."""

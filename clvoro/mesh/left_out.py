@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy
 import shapely
 
 from ..arguments import format_point
+from ..geometry.polygon import Polygon
 from .connectivity import following, take_rows
+from .faces import Faces
 from .geometry import polygon_areas
 from .read_only import Sealed
-
-if TYPE_CHECKING:
-    from ..geometry.polygon import Polygon
-    from .faces import Faces
 
 SMALLEST = 0.25
 """Smallest measure of a part over that of cells there."""

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ..geometry.polygon import Polygon
 from ..geometry.rings import WALL_CORNER
-
-if TYPE_CHECKING:
-    from ..geometry.polygon import Polygon
-    from .diagram import Diagram
+from .diagram import Diagram
 
 LEAST_BULGE = 0.1
 """Distance from a straight side over the size of the cell at which a vertex of the domain becomes a corner of it."""

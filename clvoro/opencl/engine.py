@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, NamedTuple, cast
+from typing import NamedTuple, cast
 
 import numpy as np
 import pyopencl as cl
 import pyopencl.array as cla
+from numpy.typing import ArrayLike, DTypeLike
 
 from . import program, ranges
 from .device_array import make_array
@@ -15,9 +16,6 @@ from .kernels import KernelPool, Kernels, bind, fit_group, range_of
 from .peers import ALONE, Peers
 from .ranges import enqueue_ranges
 from .workspace import Workspace
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike, DTypeLike
 
 ITEM_GROUP = 64
 """Work-items per group of a kernel in which each work-item does one item."""

@@ -7,15 +7,13 @@ import math
 import os
 import time
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar, cast
+from typing import Any, NamedTuple, TypeVar, cast
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ..errors import InputError, InputTypeError, RankError
 from ..version import __version__
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
 
 Made = TypeVar("Made")
 PATIENCE, NAPS = 2, (1e-4, 2e-3)

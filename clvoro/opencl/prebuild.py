@@ -29,18 +29,15 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import pyopencl as cl
 
 from . import program as _program
+from .engine import Engine
 from .program import UNOPTIMIZED, build_in_threads, on_pocl, program_text, text_for_driver
 from .runtimes import cache_home
-
-if TYPE_CHECKING:
-    from .engine import Engine
-
 
 PATIENCE = 0.5
 """Seconds that kernels are built before a line on the terminal says so."""

@@ -5,16 +5,14 @@ from __future__ import annotations
 import queue
 import threading
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
+from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ..arguments import WARNING, warn
 from ..errors import RankError
 from .peers import Peers, Swap
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
 
 Made = TypeVar("Made")
 _Calls: TypeAlias = "queue.SimpleQueue[Callable[[], object] | None]"

@@ -5,16 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from numbers import Real
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ..errors import InputError, InputTypeError
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
-
-    from ..geometry.domain import Domain
+from ..geometry.domain import Domain
 
 _MAX_GROWTH = 10  # a larger value is meant as a percentage
 

@@ -4,21 +4,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy
+from numpy.typing import ArrayLike
 
 from ..arguments import check_cell_values
 from ..errors import InputTypeError
 from ..mesh.diagram import Diagram
 from ..mesh.results import Result
+from ..opencl.engine import Engine
 from .graded import default_engine
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
-
-    from ..opencl.engine import Engine
 
 _SMALLEST_PIVOT = {np.dtype(np.float64): 1e-10, np.dtype(np.float32): 1e-4}
 

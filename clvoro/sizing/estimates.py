@@ -5,23 +5,19 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from numbers import Real
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import scipy
+from numpy.typing import ArrayLike
 
 from ..arguments import check_cell_values
 from ..errors import InputError, InputTypeError
+from ..mesh.diagram import Diagram
+from ..mesh.results import Result
 from .arguments import check_positive, check_slope
 from .cells import OnCells
 from .derivatives import CellStencils, derivatives
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
-
-    from ..mesh.diagram import Diagram
-    from ..mesh.results import Result
-
 
 FLAT = 1e-12
 """Share of the largest derivative below which a derivative counts as 0."""

@@ -2,21 +2,16 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
+import pyopencl.array as cla
 
 from ..arguments import format_point
 from ..errors import SizeFieldError
+from ..geometry.domain import Domain
+from ..opencl.engine import Engine
 from .arguments import advice_for_size
 from .codegen import generate_code
 from .field import Constant, Field, as_field, on_domain
-
-if TYPE_CHECKING:
-    import pyopencl.array as cla
-
-    from ..geometry.domain import Domain
-    from ..opencl.engine import Engine
 
 _ALL_VALID = np.iinfo(np.int32).max
 

@@ -5,16 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from itertools import product
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
+import pyopencl.array as cla
 
-if TYPE_CHECKING:
-    import pyopencl.array as cla
-
-    from ..geometry.domain import Domain
-    from ..geometry.sphere import Sphere
-    from ..opencl.engine import Engine
+from ..geometry.domain import Domain
+from ..geometry.sphere import Sphere
+from ..opencl.engine import Engine
 
 _TILE = {2: 16, 3: 8}  # nodes along a side
 _PASSES = 16  # between two reads of the active tiles by the host

@@ -5,19 +5,16 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, overload
+from typing import overload
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ..errors import InputError
+from ..mesh.diagram import Diagram
+from ..mesh.results import Result
 from .estimates import SMOOTHED, Estimate, Places, best_sizes, check_p, curvature_of, estimate, steepness
 from .raster import Raster, check_box, fill_missing
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
-
-    from ..mesh.diagram import Diagram
-    from ..mesh.results import Result
 
 _GROWTH = 1.2
 

@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
+import pyopencl.array as cla
 import scipy
 
+from ..geometry.domain import Domain
 from ..graphs import components
-
-if TYPE_CHECKING:
-    import pyopencl.array as cla
-
-    from ..geometry.domain import Domain
-    from ..opencl.engine import Engine
-    from ..tessellation.device_diagram import Tessellation
+from ..opencl.engine import Engine
+from ..tessellation.device_diagram import Tessellation
 
 
 class Components:

@@ -16,7 +16,6 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pyopencl as cl
@@ -26,10 +25,7 @@ from ..geometry.domain import ClipBox
 from ..opencl.device_array import buffer_of
 from ..opencl.engine import Engine, PartialSums
 from ..opencl.peers import Peers, Swap
-
-if TYPE_CHECKING:
-    from .device_diagram import Tessellation
-
+from .device_diagram import Tessellation
 
 SUMS = 256
 """Number of partial sums over the cells of a part."""

@@ -12,7 +12,6 @@ McRae, Cotter, Budd, SIAM J. Sci. Comput. 40, 2018). It is solved on the host, i
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy
@@ -22,10 +21,8 @@ from ...errors import TangledMeshWarning
 from ...geometry.domain import Domain
 from ...solvers.linear_system import Solution
 from ..motion import Displacement, Method
+from ..state import MeshState
 from .lattice import mirrored
-
-if TYPE_CHECKING:
-    from ..state import MeshState
 
 REACH = 1.5
 """Distance of neighbors over the spacing of the lattice: 6 in a hexagonal one, 14 in a body-centered cubic one, and

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from functools import lru_cache, reduce
 from itertools import product
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-if TYPE_CHECKING:
-    from ...geometry.domain import Domain
+from ...geometry.domain import Domain
 
 _HALVED = 0.5 ** np.arange(64)
 _ALL = slice(None)

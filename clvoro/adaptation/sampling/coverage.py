@@ -5,15 +5,13 @@ from __future__ import annotations
 import math
 from functools import lru_cache
 from itertools import product
-from typing import TYPE_CHECKING
 
 import numpy as np
 import shapely
 
-if TYPE_CHECKING:
-    from ...geometry.domain import Domain
-    from ...geometry.polygon import Polygon
-    from .box_tree import BoxTree
+from ...geometry.domain import Domain
+from ...geometry.polygon import Polygon
+from .box_tree import BoxTree
 
 _LEAST = 1e-12  # share of a box below which it counts as outside
 _SLIVER = 1e-9  # share of a box that may be outside if it counts as inside

@@ -4,18 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import reduce
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ...arguments import format_point
 from ...errors import InputTypeError, SizeFieldError
+from ...geometry.domain import Domain
 from ...sizing.arguments import advice_for_size
 from .box_tree import BoxTree, hilbert_tables
 from .coverage import coverage_of, gauss_rule
-
-if TYPE_CHECKING:
-    from ...geometry.domain import Domain
 
 _BASE = {2: 1024, 3: 4096}  # initial boxes inside the domain, at least
 _MAX_BASE = {2: 16384, 3: 65536}  # initial boxes in total, at most

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ...errors import ClvoroError
-
-if TYPE_CHECKING:
-    from ..diagram import Diagram
+from ..diagram import Diagram
 
 ROUNDINGS = 256
 """Tolerance of positions, in units of round-off: eps times the size of the domain and its distance from 0.

@@ -8,24 +8,20 @@ cell's own.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy
 
 from ...graphs import components
 from ..connectivity import take_rows
+from ..diagram import Diagram
 from ..geometry import sum_rows
 from ..lookup import lifted, power_tree
+from ..results import Result
 from .findings import ROUNDINGS, Check, Report, StopError
 from .polygon import check_cells, check_edges, check_outlines, hidden
-from .rebuilt import check_generators, check_places, rebuild_cells
+from .rebuilt import Doubts, Rebuilt, check_generators, check_places, rebuild_cells
 from .values import check_values
-
-if TYPE_CHECKING:
-    from ..diagram import Diagram
-    from ..results import Result
-    from .rebuilt import Doubts, Rebuilt
 
 
 def check_corners(check: Check) -> None:

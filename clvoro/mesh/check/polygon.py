@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 import scipy
 import shapely
 
-from ...geometry.polygon import BOUNDARY_SHIFTS
+from ...geometry.polygon import BOUNDARY_SHIFTS, Polygon
 from ..connectivity import following
-
-if TYPE_CHECKING:
-    from ...geometry.polygon import Polygon
-    from ..diagram import Diagram
-    from .findings import Check
-    from .rebuilt import Rebuilt
+from ..diagram import Diagram
+from .findings import Check
+from .rebuilt import Rebuilt
 
 ASIDE = 16 + 2 * max(BOUNDARY_SHIFTS)
 """Distance of corners from the domain, in units of round-off, that is allowed: the device shifts the boundary where it

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy
@@ -13,10 +12,7 @@ from ...geometry.sphere import Sphere, arc_excess, triangle_areas
 from ..connectivity import following
 from ..diagram import Diagram
 from ..geometry import sum_rows
-from .findings import ROUNDINGS
-
-if TYPE_CHECKING:
-    from .findings import Check
+from .findings import ROUNDINGS, Check
 
 
 def rebuild_on_sphere(diagram: Diagram) -> dict[str, np.ndarray]:

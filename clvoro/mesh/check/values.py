@@ -2,19 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
-from ..results import figures
+from ..diagram import Diagram
+from ..results import Result, figures
 from ..straightening import cell_quality, cell_sizes
-from .findings import ROUNDINGS
-
-if TYPE_CHECKING:
-    from ..diagram import Diagram
-    from ..results import Result
-    from .findings import Check
-    from .rebuilt import Rebuilt
+from .findings import ROUNDINGS, Check
+from .rebuilt import Rebuilt
 
 LOOSE = 256 * float(np.finfo(np.float32).eps)
 """Tolerance of means in the history, in any precision: the device sums the quality in float32."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from copy import copy as shallow_copy
 from dataclasses import replace
 from functools import cached_property
-from typing import TYPE_CHECKING, cast
+from typing import cast
 
 import numpy as np
 import pyopencl.array as cla
@@ -13,6 +13,7 @@ import pyopencl.array as cla
 from ...errors import InputError
 from ...finite_volumes.borders import on_surfaces
 from ...geometry.domain import ClipBox, Domain
+from ...geometry.solid.solid import Solid
 from ...graphs import first_nodes
 from ...mesh.connectivity import used_indices
 from ...mesh.diagram import Diagram
@@ -26,9 +27,6 @@ from ..tessellator import Tessellator
 from ..topology3d.consistency import SharedFaces, share_faces
 from ..vertices import VertexNumbering, Vertices
 from .cut_faces import CutFaces, chain_faces, join_loops
-
-if TYPE_CHECKING:
-    from ...geometry.solid.solid import Solid
 
 SMALL_FACE = 1e-3
 """Share of the mean face: areas of smaller ones are compared with those of their vertices, where these were merged."""
