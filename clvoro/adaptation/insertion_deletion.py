@@ -16,20 +16,7 @@ from ..opencl.engine import Engine
 from ..opencl.launch import one_group_limit
 from ..opencl.primitives import NamedArrays, Scan
 from ..tessellation.device_diagram import Tessellation
-from .tuning import (
-    CLIMB_STRAIN,
-    LOG_RATIO_RINGS,
-    MAX_CHANGE,
-    NUCLEATION_STRAIN,
-    NUCLEUS_RINGS,
-    PAIR_RINGS,
-    REPAIRED_SHARE,
-    ROUNDS,
-    SHIFT_STEP,
-    SHIFTS,
-    SPLIT_DISTANCE,
-    WALL_STRAIN,
-)
+from . import tuning
 
 NEVER = 2**31 - 1  # faces from which cells are split, where all are deleted
 HISTOGRAM = 128  # a power of two, so that bins are divided evenly down to single keys
@@ -90,7 +77,7 @@ class Change:
     """Pairs of dislocations to nucleate."""
     climb: bool = True
     """In 2D, let dislocations climb. Otherwise only the number is corrected, exactly."""
-    climb_strain: float = CLIMB_STRAIN
+    climb_strain: float = tuning.CLIMB_STRAIN
     """Strain above which a dislocation climbs. Above `CLIMB_STRAIN`, dislocations at walls do not change."""
 
 
@@ -105,10 +92,10 @@ class InsertionDeletion:
         self._kernels = engine.kernels(
             "adaptation/insertion_deletion",
             {
-                "WALL_STRAIN": WALL_STRAIN,
-                "SHIFTS": SHIFTS,
-                "SHIFT_STEP": SHIFT_STEP,
-                "SPLIT_DISTANCE": SPLIT_DISTANCE,
+                "WALL_STRAIN": tuning.WALL_STRAIN,
+                "SHIFTS": tuning.SHIFTS,
+                "SHIFT_STEP": tuning.SHIFT_STEP,
+                "SPLIT_DISTANCE": tuning.SPLIT_DISTANCE,
                 "HISTOGRAM": HISTOGRAM,
             },
         )
@@ -126,7 +113,7 @@ class InsertionDeletion:
         n = self._count(t)
         # A remainder of less than 0.7 generators only changes the sizes of cells. A large change takes several calls.
         need = math.trunc(change.missing + math.copysign(0.3, change.missing))
-        most = max(4, int(MAX_CHANGE * n))
+        most = max(4, int(tuning.MAX_CHANGE * n))
         need = max(-most, min(most, need))
         marks = _Marks.clean(self._room, t, self.engine.dim)
         if change.climb:
@@ -146,7 +133,12 @@ class InsertionDeletion:
         return self._apply(present, marks)
 
     def repair_cells(
-        self, present: Present, quality: cla.Array, deficit: float, split: bool = False, share: float = REPAIRED_SHARE
+        self,
+        present: Present,
+        quality: cla.Array,
+        deficit: float,
+        split: bool = False,
+        share: float = tuning.REPAIRED_SHARE,
     ) -> Outcome | None:
         """Delete or split the worst inner cells of a mesh in 2D. None if nothing changes.
 
@@ -168,7 +160,7 @@ class InsertionDeletion:
         deficit = engine.real.type(deficit)
         engine.run_each(k.score_bad_cells, n, *t.graph, quality, deficit, *t.name_args, keys)
         self._drop_fixed(present, keys, neighbors=True)
-        chosen = self._choose(t, keys, PAIR_RINGS)
+        chosen = self._choose(t, keys, tuning.PAIR_RINGS)
         self._limit(t, chosen, most)
         self._mark_split_delete(t, chosen, 6 if split else 7, marks)
         self._room.clear("keys", "spread", "chosen", "latest")
@@ -211,10 +203,10 @@ class InsertionDeletion:
     def _nucleate(self, present: Present, kinds: cla.Array, strain: cla.Array, marks: _Marks, nuclei: int) -> None:
         """Mark at most `nuclei` insertions and as many mergers where the perfect lattice is strained most."""
         engine, k, t, n = self.engine, self._kernels, present.t, present.t.n
-        keys, names, limit = self._keys(t), t.name_args, engine.real.type(NUCLEATION_STRAIN)
+        keys, names, limit = self._keys(t), t.name_args, engine.real.type(tuning.NUCLEATION_STRAIN)
         engine.run_each(k.score_strain, n, *t.graph, kinds, strain, limit, *names, keys)
         self._drop_fixed(present, keys, neighbors=True)
-        chosen = self._choose(t, keys, NUCLEUS_RINGS)
+        chosen = self._choose(t, keys, tuning.NUCLEUS_RINGS)
         self._limit(t, chosen, 2 * nuclei)
         ranks = self._room("ranks", size=n + 1, dtype=np.int32)
         engine.run_each(k.flag_sites, n, chosen, ranks)
@@ -248,18 +240,18 @@ class InsertionDeletion:
         real, strain_limit = engine.real.type, engine.real.type(change.climb_strain)
         partners = self._room("partners", size=4 * t.rows, dtype=np.int32).reshape(-1, 4)
         pull, keys, names = self._room("pull", size=t.rows), self._keys(t), t.name_args
-        lattice = *t.graph, t.points, kinds, strain, np.int32(change.climb_strain <= CLIMB_STRAIN)
+        lattice = *t.graph, t.points, kinds, strain, np.int32(change.climb_strain <= tuning.CLIMB_STRAIN)
         pairs = partners, pull, keys
         engine.run_each(k.score_pairs, n, *lattice, *names, *pairs, *engine.period_args)
         self._drop_fixed(present, keys, neighbors=True)
         if change.nuclei:
-            engine.run_each(k.drop_sites, n, self.spread(t, marks.busy, PAIR_RINGS), keys)
-        chosen = self._choose(t, keys, PAIR_RINGS)
-        tally = self._room.zeros("tally", size=SHIFTS, dtype=np.int32)
+            engine.run_each(k.drop_sites, n, self.spread(t, marks.busy, tuning.PAIR_RINGS), keys)
+        chosen = self._choose(t, keys, tuning.PAIR_RINGS)
+        tally = self._room.zeros("tally", size=tuning.SHIFTS, dtype=np.int32)
         engine.run_each(k.count_pair_changes, n, chosen, pull, kinds, partners, strain_limit, tally)
         changes = engine.peers.total(tally.get())
         # The shift whose change is closest to the need; the smallest of equal ones.
-        shifts = (np.arange(SHIFTS) - SHIFTS // 2) * SHIFT_STEP
+        shifts = (np.arange(tuning.SHIFTS) - tuning.SHIFTS // 2) * tuning.SHIFT_STEP
         order = np.argsort(np.abs(shifts), kind="stable")
         best = order[np.argmin(np.abs(changes[order] - need))]
         t.forward(engine, chosen, pull, partners)
@@ -274,8 +266,8 @@ class InsertionDeletion:
         sign, keys = engine.real.type(math.copysign(1, rest)), self._keys(t)
         engine.run_each(k.score_log_ratio, n, *t.graph, log_ratio, sign, *t.name_args, keys)
         self._drop_fixed(present, keys, neighbors=False)
-        engine.run_each(k.drop_sites, n, self.spread(t, marks.busy, LOG_RATIO_RINGS), keys)
-        chosen = self._choose(t, keys, LOG_RATIO_RINGS)
+        engine.run_each(k.drop_sites, n, self.spread(t, marks.busy, tuning.LOG_RATIO_RINGS), keys)
+        chosen = self._choose(t, keys, tuning.LOG_RATIO_RINGS)
         self._limit(t, chosen, rest if rest > 0 else min(-rest, self._count(t) - 1))
         self._mark_split_delete(t, chosen, 0 if rest > 0 else NEVER, marks)
 
@@ -305,7 +297,7 @@ class InsertionDeletion:
         self._drop_fixed(present, keys, neighbors=True)
         return self._choose(present.t, keys, rings, rounds=1)
 
-    def _choose(self, t: Tessellation, keys: cla.Array, rings: int, rounds: int = ROUNDS) -> cla.Array:
+    def _choose(self, t: Tessellation, keys: cla.Array, rings: int, rounds: int = tuning.ROUNDS) -> cla.Array:
         """Return the keys of the strongest sites that are `rings` rings apart. `keys` is overwritten."""
         engine, k, n = self.engine, self._kernels, t.n
         chosen = self._room.zeros("chosen", size=t.rows, dtype=np.uint64)

@@ -18,16 +18,7 @@ from ..opencl.device_array import read_numbers
 from ..opencl.engine import Engine
 from ..opencl.workspace import framed
 from ..solvers.components import Components, balance_components
-from .tuning import (
-    BALANCE_TOLERANCE,
-    BLOCKED_RINGS,
-    LARGEST_OFFSET,
-    LEAST_CHANGES,
-    LEAST_GAIN,
-    LEAST_OFFSET,
-    PIECE,
-    SITE_RINGS,
-)
+from . import tuning
 
 if TYPE_CHECKING:
     from .density import CellWeights
@@ -36,8 +27,8 @@ if TYPE_CHECKING:
 
 def offset_of(missing: np.ndarray | float, cells: np.ndarray | float) -> np.ndarray:
     """Return the offset of the potential in a piece that has `cells` cells and lacks `missing` more."""
-    each = np.clip(PIECE / cells, LEAST_OFFSET, LEAST_GAIN)
-    return np.clip(each * missing, -LARGEST_OFFSET, LARGEST_OFFSET)
+    each = np.clip(tuning.PIECE / cells, tuning.LEAST_OFFSET, tuning.LEAST_GAIN)
+    return np.clip(each * missing, -tuning.LARGEST_OFFSET, tuning.LARGEST_OFFSET)
 
 
 class PieceCounts:
@@ -83,23 +74,23 @@ class LocalCounts:
         missing, total = mesh.missing_cells(w), 0
         pieces = PieceCounts(mesh, w) if mesh.domain.n_pieces > 1 else None
         graph = *t.graph, t.face_measures, t.points
-        laplacian = poisson.assemble(*graph, tolerance=BALANCE_TOLERANCE, part=t.part)
+        laplacian = poisson.assemble(*graph, tolerance=tuning.BALANCE_TOLERANCE, part=t.part)
         for turn in count():
             offset = real(offset_of(missing, math.inf) if pieces is None else 0)
             if turn:
                 if pieces is not None:
                     pieces.offset(potential, changes)
-                gains = w.log_ratio, potential, offset, real(LEAST_GAIN)
-                away = selection.spread(t, blocked, BLOCKED_RINGS)
+                gains = w.log_ratio, potential, offset, real(tuning.LEAST_GAIN)
+                away = selection.spread(t, blocked, tuning.BLOCKED_RINGS)
                 engine.run_each(k.score_potential, n, *t.graph, *gains, away, *t.name_args, keys)
-                chosen = selection.choose_once(mesh.present, keys, SITE_RINGS)
+                chosen = selection.choose_once(mesh.present, keys, tuning.SITE_RINGS)
             engine.run_each(k.try_changes, n, w.weight, changes, chosen, potential, offset, before, source)
             balance_components(mesh.engine, mesh.domain, t, source, w.weight)
             poisson.solve(
                 laplacian,
                 source,
                 potential,
-                tolerance=BALANCE_TOLERANCE,
+                tolerance=tuning.BALANCE_TOLERANCE,
                 preconditioner="multigrid",
                 from_zero=turn == 0,
             )
@@ -108,12 +99,12 @@ class LocalCounts:
             if pieces is not None:
                 pieces.offset(potential, changes)
             self._accepted.fill(0)
-            gains = chosen, before, potential, offset, real(LEAST_GAIN)
+            gains = chosen, before, potential, offset, real(tuning.LEAST_GAIN)
             found = changes, blocked, self._accepted
             engine.run_each(k.accept_changes, n, *gains, *found)
             inserted, deleted = map(int, engine.peers.total(read_numbers(self._accepted, 0, 2)))
             missing, total = missing - inserted + deleted, total + inserted + deleted
-            if inserted + deleted <= LEAST_CHANGES * mesh.total:
+            if inserted + deleted <= tuning.LEAST_CHANGES * mesh.total:
                 break
         return total > 0
 

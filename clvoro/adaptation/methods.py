@@ -25,21 +25,12 @@ from ..opencl.device_array import buffer_of
 from ..solvers.components import balance_components
 from ..solvers.linear_system import Limits
 from ..solvers.volume_projection import Penalty, Targets
+from . import tuning
 from .density import CellWeights
 from .motion import Displacement, Method
 from .moving.mmpde import MmpdeMethod
 from .moving.monge_ampere import MongeAmpereMethod
 from .state import MeshState
-from .tuning import (
-    AT_WALLS,
-    AT_WALLS_OF_BOXES,
-    CALM_BAD_CELL_WEIGHT,
-    CALM_MOMENTUM,
-    EXACT_PENALTY_PER_ERROR,
-    MET_ERROR,
-    MOST_AT_WALLS,
-    PENALTY_PER_ERROR,
-)
 
 
 @dataclass(frozen=True)
@@ -194,8 +185,8 @@ class ProjectedMethod(Method):
         stages, t, engine = mesh.stages, mesh.t, mesh.engine
         relaxation, momentum, bad_cell_weight = self.relaxation, self.momentum, self.bad_cell_weight
         if mesh.has_thin_walls:
-            relaxation, momentum = (min(relaxation, self.calm_relaxation), min(momentum, CALM_MOMENTUM))
-            bad_cell_weight = min(bad_cell_weight, CALM_BAD_CELL_WEIGHT)
+            relaxation, momentum = (min(relaxation, self.calm_relaxation), min(momentum, tuning.CALM_MOMENTUM))
+            bad_cell_weight = min(bad_cell_weight, tuning.CALM_BAD_CELL_WEIGHT)
         lloyd, correction = engine.scratch(mesh.points.shape), engine.scratch(mesh.points.shape)
         gradient, log_ratio = engine.scratch(mesh.points.shape), engine.scratch(mesh.n)
         with engine.workspace.frame():
@@ -242,11 +233,13 @@ class ProjectedMethod(Method):
         """Return the penalty for the present errors of the sizes."""
         penalty, scale = self.penalty, self.log_ratio_scale
         if self.careful:
-            beyond = mesh.mean_log_ratio_error(w) - MET_ERROR
-            penalty = max(penalty, EXACT_PENALTY_PER_ERROR * beyond)
+            beyond = mesh.mean_log_ratio_error(w) - tuning.MET_ERROR
+            penalty = max(penalty, tuning.EXACT_PENALTY_PER_ERROR * beyond)
         if self.scale_per_error:
             scale = max(scale, self.scale_per_error * mesh.mean_log_ratio_error(w) - 3 * scale)
-        at_walls, most = (AT_WALLS, MOST_AT_WALLS) if mesh.domain.cuts_cells else (AT_WALLS_OF_BOXES, math.inf)
+        at_walls, most = (
+            (tuning.AT_WALLS, tuning.MOST_AT_WALLS) if mesh.domain.cuts_cells else (tuning.AT_WALLS_OF_BOXES, math.inf)
+        )
         return Penalty(penalty, self.quality_scale, scale, at_walls, self.power, most)
 
     def _descend(self, mesh: MeshState, lloyd: cla.Array, bad_cell_weight: float) -> None:
@@ -261,7 +254,7 @@ class ProjectedMethod(Method):
     def _control_penalty(self, error: float) -> None:
         """Change the penalty towards the one that gives the error target."""
         change = self.error_target / max(error, 1e-9)  # the error may be 0
-        largest = max(3.0, PENALTY_PER_ERROR * self.error_target)
+        largest = max(3.0, tuning.PENALTY_PER_ERROR * self.error_target)
         least = min(1e-3, self.error_target)
         self.penalty = min(largest, max(least, self.penalty * min(1.33, max(0.75, change))))
 

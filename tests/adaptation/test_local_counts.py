@@ -5,7 +5,7 @@ import pyopencl as cl
 import pytest
 
 import clvoro
-from clvoro.adaptation import local_counts
+from clvoro.adaptation import tuning
 from clvoro.adaptation.plan.actions import BalanceCounts, Refine, RepairCells
 from clvoro.adaptation.plan.schedule import adaptive_schedule
 from clvoro.adaptation.stages import Stages
@@ -81,7 +81,7 @@ def energy_of(mesh):
 @pytest.mark.parametrize(("name", "fixed"), [("rooms", 0), ("rooms", 40), ("and a piece", 0)])
 def test_choice(ctx, monkeypatch, name, fixed):
     """With exact potentials the sites are those of the reference, also next to fixed generators."""
-    monkeypatch.setattr(local_counts, "BALANCE_TOLERANCE", 1e-11)
+    monkeypatch.setattr(tuning, "BALANCE_TOLERANCE", 1e-11)
     points = unbalanced((14, 8), (8, 11), name != "rooms")
     mesh = make_mesh(ctx, DOMAINS[name], points, fixed)
     found = chosen(mesh)

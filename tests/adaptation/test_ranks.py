@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 import clvoro
-from clvoro.adaptation import estimates, run
+from clvoro.adaptation import estimates, run, tuning
 from clvoro.adaptation.plan import schedule
 from clvoro.cli.cases import load_case
 from clvoro.cli.jobs import Job
@@ -388,7 +388,7 @@ def test_checkpoints_are_resumed_on_any_number_of_parts(ctx, tmp_path, monkeypat
 
 def test_parts_join_a_run(ctx, tmp_path, monkeypatch):
     """From a checkpoint of a level on which one part works, and where that level turns out to be too coarse."""
-    monkeypatch.setitem(schedule.COARSEST, 2, 60)
+    monkeypatch.setitem(tuning.COARSEST, 2, 60)
     given = clvoro.Box((0, 0), (4, 0.7), periodic=(False, True)), 0.06
     state, short = tmp_path / "state", {"effort": "fast", "max_steps": 9}
     whole = run_in(2, ctx, *given, **short, checkpoint=clvoro.Checkpoint(state, 0))[1]

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.sparse import csgraph, csr_array
 
-from clvoro.adaptation import local_counts as stage
+from clvoro.adaptation import tuning
 
 
 @dataclass
@@ -55,14 +55,14 @@ def changes(cells: Cells, held: np.ndarray) -> np.ndarray:
             offset[i] = min(max(each * lacking, -3), 3) - phi[piece].mean()
         sign = np.where(phi + offset > 0, 1, -1)
         magnitude = np.abs(phi + offset) + sign * need - cells.walled
-        near = ((rings <= stage.BLOCKED_RINGS) & blocked).any(axis=1)
-        magnitude[closed | near | (np.abs(phi + offset) <= stage.LEAST_GAIN)] = 0
-        within = np.where(rings <= stage.SITE_RINGS, magnitude, 0).max(axis=1)
+        near = ((rings <= tuning.BLOCKED_RINGS) & blocked).any(axis=1)
+        magnitude[closed | near | (np.abs(phi + offset) <= tuning.LEAST_GAIN)] = 0
+        within = np.where(rings <= tuning.SITE_RINGS, magnitude, 0).max(axis=1)
         sites = (magnitude > 0) & (magnitude == within)
         after = cells.potential(cells.weight - 1 - found - np.where(sites, sign, 0))
         shift = [phi[piece].mean() - after[piece].mean() for piece in np.isfinite(rings)]
         gain = sign * ((phi + after + shift) / 2 + offset)
-        accepted = sites & (gain >= stage.LEAST_GAIN)
+        accepted = sites & (gain >= tuning.LEAST_GAIN)
         if not accepted.any():
             return found
         found, blocked, phi = found + np.where(accepted, sign, 0), blocked | sites, after

@@ -42,50 +42,9 @@ from collections.abc import Iterator
 from dataclasses import replace
 from typing import Literal
 
+from .. import tuning
 from ..methods import ProjectedMethod, WeightedMethod
 from ..motion import Method
-from ..tuning import (
-    COARSE_PENALTY,
-    COARSE_TOLERANCE,
-    COARSEST,
-    COUNT_CLIMB_STRAIN,
-    COUNT_EXACTLY,
-    COUNT_FINEST_3D,
-    COUNT_LEAST,
-    COUNT_SHARE,
-    EXACT_ITERATIONS,
-    EXACT_PENALTY,
-    EXACT_STEPS,
-    EXACT_TOLERANCE,
-    GLIDE_TOLERANCE,
-    GRADUAL_ITERATIONS,
-    GRADUAL_NEWTON_STEPS,
-    GRADUAL_PENALTIES,
-    GRADUAL_TOLERANCE,
-    LOOSE_POLISH_3D,
-    NEAR_PENALTY,
-    NEWTON_ITERATIONS_3D,
-    NEWTON_PENALTY,
-    NEWTON_QUALITY_SCALE,
-    NEWTON_STEPS,
-    NEWTON_TOLERANCES_3D,
-    OPENING_PROJECTIONS,
-    POLISH_COUNT_3D,
-    POLISH_GROWTH_3D,
-    POLISH_MOMENTUM_3D,
-    POLISH_RATE_3D,
-    POLISH_TOLERANCE,
-    PROJECT_STEPS,
-    SCALE_PER_ERROR_3D,
-    SEPARATE_PENALTY,
-    SETTLE_PENALTY_3D,
-    SETTLING_STEPS,
-    SINGLE_LEVEL_QUALITY_SCALE,
-    START_TOLERANCE,
-    STEP_CELLS,
-    STRIDE,
-    TIGHT,
-)
 from .actions import (
     Action,
     BalanceCounts,
@@ -108,7 +67,7 @@ COUPLE = WeightedMethod(cautious=True, tolerance=0.2, max_cycles=1)
 
 def auto_levels(n: float, dim: int) -> int:
     """Return the number of coarser levels for a mesh of `n` cells."""
-    return max(0, round(math.log(max(n, 1) / COARSEST[dim], 2**dim)))
+    return max(0, round(math.log(max(n, 1) / tuning.COARSEST[dim], 2**dim)))
 
 
 def repeated_schedule(method: Method, steps: int) -> list[Action]:
@@ -158,7 +117,7 @@ def adaptive_schedule(
             break
         settings = replace(settings, **{name: getattr(settings, name) - 1})
         schedule = planned(settings)
-    projections = EXACT_STEPS if exact else 0
+    projections = tuning.EXACT_STEPS if exact else 0
     if narrow_parts:
         polish = schedule.index(ResetMomentum()) - 1
         for k in reversed(range(len(schedule))):
@@ -169,17 +128,17 @@ def adaptive_schedule(
             assert isinstance(last, Step)
             assert isinstance(last.method, ProjectedMethod)
             schedule[-projections:] = _gradual(last.method)
-            projections = len(GRADUAL_PENALTIES) + GRADUAL_NEWTON_STEPS
+            projections = len(tuning.GRADUAL_PENALTIES) + tuning.GRADUAL_NEWTON_STEPS
     return _opened(schedule, projections, openings) if openings else schedule
 
 
 def _gradual(newton: ProjectedMethod) -> list[Action]:
     """Return the exact projections in polygons, given Newton's step of those in boxes."""
-    base = replace(newton, tolerance=GRADUAL_TOLERANCE, iterations=GRADUAL_ITERATIONS, careful=True)
+    base = replace(newton, tolerance=tuning.GRADUAL_TOLERANCE, iterations=tuning.GRADUAL_ITERATIONS, careful=True)
     first = replace(base, descent="quality", relaxation=1.0, momentum=0.7)
-    last = replace(base, descent="edges", relaxation=1.0, quality_scale=NEWTON_QUALITY_SCALE)
-    methods = [replace(first, penalty=p, quality_scale=scale) for p, scale in GRADUAL_PENALTIES]
-    return [Step(method) for method in [*methods, *[last] * GRADUAL_NEWTON_STEPS]]
+    last = replace(base, descent="edges", relaxation=1.0, quality_scale=tuning.NEWTON_QUALITY_SCALE)
+    methods = [replace(first, penalty=p, quality_scale=scale) for p, scale in tuning.GRADUAL_PENALTIES]
+    return [Step(method) for method in [*methods, *[last] * tuning.GRADUAL_NEWTON_STEPS]]
 
 
 def _opened(schedule: list[Action], exact: int, openings: int) -> list[Action]:
@@ -189,13 +148,13 @@ def _opened(schedule: list[Action], exact: int, openings: int) -> list[Action]:
     """
     steps = [k for k, action in enumerate(schedule) if isinstance(action, Step)]
     # Exact projections close some triangles again, and correct the sizes of opened ones.
-    opening = steps[-OPENING_PROJECTIONS if exact else -1 :]
+    opening = steps[-tuning.OPENING_PROJECTIONS if exact else -1 :]
     for k in opening:
         step = schedule[k]
         assert isinstance(step, Step)
         schedule[k] = replace(step, openings=openings)
-    before = steps[-min(len(steps), SETTLING_STEPS + exact)]
-    repair = [RepairCells(math.inf), CorrectCount(COUNT_EXACTLY if exact else 0.0)]
+    before = steps[-min(len(steps), tuning.SETTLING_STEPS + exact)]
+    repair = [RepairCells(math.inf), CorrectCount(tuning.COUNT_EXACTLY if exact else 0.0)]
     return [*schedule[:before], *repair, *schedule[before:]]
 
 
@@ -212,12 +171,12 @@ def _adaptive_2d(effort: Effort, levels: int, exact: bool, error_target: float, 
         effort.momentum,
         penalty=0.1,
         calm_relaxation=effort.calm_relaxation,
-        tolerance=GLIDE_TOLERANCE if levels else POLISH_TOLERANCE,
+        tolerance=tuning.GLIDE_TOLERANCE if levels else tuning.POLISH_TOLERANCE,
     )
-    tolerance = START_TOLERANCE if levels else WeightedMethod.tolerance
+    tolerance = tuning.START_TOLERANCE if levels else WeightedMethod.tolerance
     start = WeightedMethod(cautious=True, tolerance=tolerance)
     if warm:
-        yield CorrectCount(COUNT_SHARE)
+        yield CorrectCount(tuning.COUNT_SHARE)
     for level in range(levels, -1, -1):
         if level < levels:
             yield Refine()
@@ -227,7 +186,7 @@ def _adaptive_2d(effort: Effort, levels: int, exact: bool, error_target: float, 
         else:
             couple = effort.start if levels else min(effort.start, effort.start_alone)
         yield from [Step(COUPLE if level < levels else start)] * couple
-        yield CorrectCount(COUNT_SHARE)
+        yield CorrectCount(tuning.COUNT_SHARE)
         sweeps = effort.sweeps[min(level, len(effort.sweeps) - 1)]
         if levels == 0:
             sweeps = effort.alone
@@ -242,14 +201,14 @@ def _adaptive_2d(effort: Effort, levels: int, exact: bool, error_target: float, 
     yield CorrectCount()
     yield ResetMomentum()
     if levels == 0:
-        effort = replace(effort, quality_scale=max(effort.quality_scale, SINGLE_LEVEL_QUALITY_SCALE))
+        effort = replace(effort, quality_scale=max(effort.quality_scale, tuning.SINGLE_LEVEL_QUALITY_SCALE))
     yield from _finish_2d(effort, exact, error_target, effort.penalty)
 
 
 def _correction(dim: int, effort: Effort, exact: bool, error_target: float) -> Iterator[Action]:
-    stride = Step(WeightedMethod(STRIDE, cautious=True))
+    stride = Step(WeightedMethod(tuning.STRIDE, cautious=True))
     yield from [stride] * 2
-    yield CorrectCount(COUNT_LEAST)
+    yield CorrectCount(tuning.COUNT_LEAST)
     yield stride
     correct = ProjectedMethod(
         "lloyd", 0.0, 0.0, penalty=1e-2, k=1.0, iterations=60, tolerance=1e-3, gradient_from_field=True
@@ -259,13 +218,13 @@ def _correction(dim: int, effort: Effort, exact: bool, error_target: float) -> I
     yield ResetMomentum()
     # The worst cells are as good as before, so there are no repairs.
     effort = replace(effort, repairs=())
-    yield from {2: _finish_2d, 3: _finish_3d}[dim](effort, exact, error_target, NEAR_PENALTY)
+    yield from {2: _finish_2d, 3: _finish_3d}[dim](effort, exact, error_target, tuning.NEAR_PENALTY)
 
 
 def _finish_2d(effort: Effort, exact: bool, error_target: float, penalty: float) -> Iterator[Action]:
     """Polish, and project."""
     looser = error_target / effort.error_target
-    tight = looser < TIGHT
+    tight = looser < tuning.TIGHT
     scale, power, bad_cell_weight = effort.log_ratio_scale * error_target, 2, effort.bad_cell_weight
     if looser > 1:
         bad_cell_weight *= min(looser, effort.loose_bad_cells)
@@ -283,37 +242,37 @@ def _finish_2d(effort: Effort, exact: bool, error_target: float, penalty: float)
         k=0.3,
         error_target=error_target,
         bad_cell_weight=bad_cell_weight,
-        tolerance=POLISH_TOLERANCE,
+        tolerance=tuning.POLISH_TOLERANCE,
         power=power,
         gradient_from_field=tight,
     )
     repairs = dict(effort.repairs)
     for step in range(effort.polish):
         if step == 3:
-            yield InsertDelete(climb_strain=COUNT_CLIMB_STRAIN, least=COUNT_LEAST)
+            yield InsertDelete(climb_strain=tuning.COUNT_CLIMB_STRAIN, least=tuning.COUNT_LEAST)
             yield CorrectCount()
         if step in repairs:
             yield repairs[step]
-            yield CorrectCount(COUNT_EXACTLY if exact or tight else 0.0)
+            yield CorrectCount(tuning.COUNT_EXACTLY if exact or tight else 0.0)
         yield Step(polish)
     if exact:
         project = ProjectedMethod(
             "quality",
-            penalty=EXACT_PENALTY,
-            iterations=EXACT_ITERATIONS,
-            tolerance=EXACT_TOLERANCE,
+            penalty=tuning.EXACT_PENALTY,
+            iterations=tuning.EXACT_ITERATIONS,
+            tolerance=tuning.EXACT_TOLERANCE,
             k=0.3,
             gradient_from_field=True,
             correct_mean=True,
         )
-        newton = replace(project, descent="lloyd", relaxation=0.0, momentum=0.0, penalty=NEWTON_PENALTY)
-        yield from [Step(project)] * PROJECT_STEPS
+        newton = replace(project, descent="lloyd", relaxation=0.0, momentum=0.0, penalty=tuning.NEWTON_PENALTY)
+        yield from [Step(project)] * tuning.PROJECT_STEPS
         yield Step(replace(COUPLE, cautious=False, lloyd=False))
         yield Step(replace(newton, descent="edges", relaxation=1.0))
-        yield from [Step(newton)] * (NEWTON_STEPS - 1)
+        yield from [Step(newton)] * (tuning.NEWTON_STEPS - 1)
     else:
         separate = replace(
-            polish, descent="edges", momentum=0.0, penalty=SEPARATE_PENALTY, quality_scale=0.0, error_target=0.0
+            polish, descent="edges", momentum=0.0, penalty=tuning.SEPARATE_PENALTY, quality_scale=0.0, error_target=0.0
         )
         yield from [Step(separate)] * effort.separate
 
@@ -321,10 +280,10 @@ def _finish_2d(effort: Effort, exact: bool, error_target: float, penalty: float)
 def _adaptive_3d(effort: Effort, levels: int, exact: bool, error_target: float, begins: Begins) -> Iterator[Action]:
     warm = begins != "random"
     couple = [Step(COUPLE)]
-    coarse_glide = _glide_3d(effort, COARSE_PENALTY, COARSE_TOLERANCE)
-    coarse_polish = _polish_3d(effort, COARSE_PENALTY, COARSE_TOLERANCE)
+    coarse_glide = _glide_3d(effort, tuning.COARSE_PENALTY, tuning.COARSE_TOLERANCE)
+    coarse_polish = _polish_3d(effort, tuning.COARSE_PENALTY, tuning.COARSE_TOLERANCE)
     if warm:
-        yield CorrectCount(COUNT_SHARE)
+        yield CorrectCount(tuning.COUNT_SHARE)
     for level in range(levels, -1, -1):
         if level < levels:
             yield Refine()
@@ -333,16 +292,16 @@ def _adaptive_3d(effort: Effort, levels: int, exact: bool, error_target: float, 
         if level:
             for steps in (effort.couple, effort.recouple):
                 yield from couple * steps
-                yield CorrectCount(COUNT_LEAST, POLISH_GROWTH_3D)
+                yield CorrectCount(tuning.COUNT_LEAST, tuning.POLISH_GROWTH_3D)
             yield from couple * effort.recouple
         if level or (not levels and begins != "mesh"):
             yield from [Step(coarse_glide)] * (effort.coarse_glide if levels else effort.alone)
             yield from [Step(coarse_polish)] * effort.coarse_polish
             yield ResetMomentum()
         if level:
-            yield CorrectCount(COUNT_LEAST, ahead=1.0)
+            yield CorrectCount(tuning.COUNT_LEAST, ahead=1.0)
     yield from couple * effort.couple_finest
-    yield CorrectCount(COUNT_FINEST_3D[exact] if levels else COUNT_LEAST)
+    yield CorrectCount(tuning.COUNT_FINEST_3D[exact] if levels else tuning.COUNT_LEAST)
     for k in range(effort.couple_finest):
         yield replace(couple[0], recent=k + 1 if levels else 0)
     yield CorrectCount()
@@ -358,26 +317,28 @@ def _glide_3d(effort: Effort, penalty: float, tolerance: float, error_target: fl
 def _polish_3d(effort: Effort, penalty: float, tolerance: float, error_target: float = 0.0) -> ProjectedMethod:
     return ProjectedMethod(
         "surface",
-        momentum=POLISH_MOMENTUM_3D,
+        momentum=tuning.POLISH_MOMENTUM_3D,
         penalty=penalty,
         tolerance=tolerance,
-        rate=POLISH_RATE_3D,
+        rate=tuning.POLISH_RATE_3D,
         bad_cell_weight=effort.bad_cell_weight,
-        error_target=LOOSE_POLISH_3D * error_target,
+        error_target=tuning.LOOSE_POLISH_3D * error_target,
         log_ratio_scale=effort.log_ratio_scale * error_target,
-        scale_per_error=SCALE_PER_ERROR_3D,
+        scale_per_error=tuning.SCALE_PER_ERROR_3D,
     )
 
 
 def _finish_3d(effort: Effort, exact: bool, error_target: float, penalty: float) -> Iterator[Action]:
     """Glide, polish, and project."""
-    glide = _glide_3d(effort, penalty, POLISH_TOLERANCE, error_target)
+    glide = _glide_3d(effort, penalty, tuning.POLISH_TOLERANCE, error_target)
     yield from [Step(glide)] * effort.glide
-    polish = _polish_3d(effort, penalty, POLISH_TOLERANCE, error_target)
-    settle = replace(polish, descent="lloyd", relaxation=0.0, momentum=0.0, penalty=SETTLE_PENALTY_3D, error_target=0.0)
+    polish = _polish_3d(effort, penalty, tuning.POLISH_TOLERANCE, error_target)
+    settle = replace(
+        polish, descent="lloyd", relaxation=0.0, momentum=0.0, penalty=tuning.SETTLE_PENALTY_3D, error_target=0.0
+    )
     yield from [Step(polish)] * (effort.polish // 2)
     # Where h is steep, cells of other shapes have their generators at other places, with other sizes.
-    yield CorrectCount(POLISH_COUNT_3D)
+    yield CorrectCount(tuning.POLISH_COUNT_3D)
     if exact:
         yield CountOfMesh()
     yield from [Step(polish)] * (effort.polish - 1 - effort.polish // 2)
@@ -385,14 +346,14 @@ def _finish_3d(effort: Effort, exact: bool, error_target: float, penalty: float)
     if exact:
         newton = replace(
             settle,
-            penalty=NEWTON_PENALTY,
+            penalty=tuning.NEWTON_PENALTY,
             log_ratio_scale=0.0,
             scale_per_error=0.0,
-            iterations=NEWTON_ITERATIONS_3D,
+            iterations=tuning.NEWTON_ITERATIONS_3D,
             gradient_from_field=True,
             correct_mean=True,
         )
-        *first, last = (replace(newton, tolerance=tolerance) for tolerance in NEWTON_TOLERANCES_3D)
+        *first, last = (replace(newton, tolerance=tolerance) for tolerance in tuning.NEWTON_TOLERANCES_3D)
         yield from [Step(method) for method in first]
         yield StepOfMesh(last)
 
@@ -408,5 +369,5 @@ def work_of(schedule: list[Action], levels: int, dim: int, cells: float) -> list
         if isinstance(action, Refine):
             level -= 1
         elif isinstance(action, Step):
-            total += cells * 2.0 ** (-dim * level) + STEP_CELLS
+            total += cells * 2.0 ** (-dim * level) + tuning.STEP_CELLS
     return [w / max(total, 1e-300) for w in done]
