@@ -22,16 +22,6 @@ def evaluate(engine, t, h, compared=None):
     return [a.get() for a in out]
 
 
-def second_moment(polygon, x):
-    """Integral of |y - x|^2 over a polygon: exact over triangles by the middles of their sides."""
-    total = 0.0
-    for a, b in zip(polygon, np.roll(polygon, -1, axis=0), strict=True):
-        area = ((a - x)[0] * (b - x)[1] - (a - x)[1] * (b - x)[0]) / 2
-        middles = np.array([(a + b) / 2, (a + x) / 2, (b + x) / 2])
-        total += area / 3 * ((middles - x) ** 2).sum()
-    return total
-
-
 @pytest.mark.sparse(1)
 def test_definitions(engine):
     points = patch.random_points(N, 618).astype(engine.real).astype(float)
@@ -57,7 +47,7 @@ def test_definitions(engine):
         n = len(cell.neighbors)
         expected = 4 * cell.area * n * np.tan(np.pi / n) / perimeter**2
         assert quality[i] == pytest.approx(expected, **close)
-        assert energy[i] == pytest.approx(second_moment(cell.polygon, points[i]), **close)
+        assert energy[i] == pytest.approx(reference.second_moment(cell.polygon, points[i]), **close)
     assert both == {True, False}, "both branches of the error"
 
 

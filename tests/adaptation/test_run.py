@@ -182,21 +182,13 @@ def test_callable_and_device_field_agree(adapter):
     assert host.points == pytest.approx(device.points, abs=1e-6)
 
 
-def second_moment(polygon, x):
-    total = 0.0
-    for a, b in zip(polygon, np.roll(polygon, -1, axis=0), strict=True):
-        area = ((a - x)[0] * (b - x)[1] - (a - x)[1] * (b - x)[0]) / 2
-        total += area / 3 * ((np.array([(a + b) / 2, (a + x) / 2, (b + x) / 2]) - x) ** 2).sum()
-    return total
-
-
 def test_history_of_the_published_method(adapter):
     result = adapter.run(BOX, F1, method="coupled", seed=77, max_steps=15, options=clvoro.PaperOptions(tol=0))
     h = result.history
     check(result, F1)
     assert len(h) == 16
     # Energy, the paper's 2.3, in physical units.
-    energy = sum(map(second_moment, runs.polygons(result.diagram), result.points))
+    energy = sum(map(reference.second_moment, runs.polygons(result.diagram), result.points))
     assert h["energy"][-1] == pytest.approx(energy, rel=1e-9)
     # The displacements in a row are those of the step before.
     size = F1(result.initial.points)

@@ -109,12 +109,11 @@ def test_figures_are_those_of_openfoam(ctx, tmp_path, name, walls):
 
 
 def test_cubes_by_hand():
-    axes = (0.5 * np.arange(k) + 0.25 for k in (3, 4, 2))
-    points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-    mesh = solids.solid_diagram((0, 0, 0), (1.5, 2, 1), points).solver_mesh()
+    cubes = solids.cubes(0.5)
+    mesh = cubes.solver_mesh()
     m = mesh.measures
     assert m.geometry.volumes == pytest.approx(0.125)
-    assert m.geometry.centroids == pytest.approx(points)
+    assert m.geometry.centroids == pytest.approx(cubes.points)
     assert m.non_orthogonality == pytest.approx(0, abs=1e-9)
     assert m.skewness == pytest.approx(0, abs=1e-9)
     assert m.aspect_ratio == pytest.approx(1)

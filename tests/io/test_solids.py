@@ -30,9 +30,7 @@ def diagram():
 
 @pytest.fixture(scope="module")
 def lattice():
-    axes = (np.arange(k) + 0.5 for k in (3, 4, 2))
-    points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-    return solids.solid_diagram((0, 0, 0), (3, 4, 2), points)
+    return solids.cubes()
 
 
 @pytest.fixture(scope="module")
@@ -47,6 +45,17 @@ def changed(diagram, **arrays):
 def loops_of(diagram):
     starts, corners = diagram.half_faces.corners
     return [corners[a:b].tolist() for a, b in itertools.pairwise(starts)]
+
+
+def with_faces(diagram, counts, neighbors, loops):
+    """Return `diagram` with other faces: how many each cell has, their neighbors and their corners."""
+    return changed(
+        diagram,
+        neighbor_starts=np.concatenate([[0], np.cumsum(counts)]).astype(np.int32),
+        neighbors=neighbors,
+        face_vertex_starts=np.cumsum([0] + [len(loop) for loop in loops]).astype(np.int32),
+        face_vertices=np.concatenate(loops).astype(np.int32),
+    )
 
 
 def decode(stream, ends):
@@ -88,13 +97,8 @@ def test_faces_without_measure_are_left_out(lattice):
     loops, first = loops_of(lattice), 6
     inserted = [[0, 1], [4, 4, 5]]
     loops[first:first] = inserted
-    d = changed(
-        lattice,
-        neighbor_starts=lattice.neighbor_starts + np.r_[0, [2] * 24].astype(np.int32),
-        neighbors=np.insert(lattice.neighbors, first, [5, 7]),
-        face_vertex_starts=np.cumsum([0] + [len(loop) for loop in loops]).astype(np.int32),
-        face_vertices=np.concatenate(loops).astype(np.int32),
-    )
+    counts = np.diff(lattice.neighbor_starts) + np.r_[2, [0] * 23]
+    d = with_faces(lattice, counts, np.insert(lattice.neighbors, first, [5, 7]), loops)
     for name, array in polyhedra(lattice).items():
         assert_same_array(polyhedra(d)[name], array)
     assert [len(loop) for loop in loops_of(d)[5:9]] == [4, 0, 0, 4]
@@ -127,13 +131,7 @@ def test_a_face_of_one_cell_only_is_reversed(diagram):
     kept = np.arange(len(owner)) != lost
     loops = [loop for loop, keep in zip(loops_of(diagram), kept, strict=True) if keep]
     counts = np.bincount(owner[kept], minlength=len(diagram))
-    d = changed(
-        diagram,
-        neighbor_starts=np.concatenate([[0], np.cumsum(counts)]).astype(np.int32),
-        neighbors=neighbor[kept],
-        face_vertex_starts=np.cumsum([0] + [len(loop) for loop in loops]).astype(np.int32),
-        face_vertices=np.concatenate(loops).astype(np.int32),
-    )
+    d = with_faces(diagram, counts, neighbor[kept], loops)
     whole, partial = diagram.faces, d.faces
     assert_same_array(whole.owner, partial.owner)
     assert_same_array(whole.neighbor, partial.neighbor)

@@ -37,9 +37,7 @@ def degrees_between(a, b):
 
 
 def test_cube_lattice():
-    axes = (0.5 * np.arange(k) + 0.25 for k in (3, 4, 2))
-    points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-    m = measure_mesh(solids.solid_diagram((0, 0, 0), (1.5, 2, 1), points))
+    m = measure_mesh(solids.cubes(0.5))
     assert m.quality == pytest.approx(np.pi / 6)
     assert m.faces.tolist() == [6] * 24
     assert m.face_ratio == pytest.approx(1)

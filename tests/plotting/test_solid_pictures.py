@@ -67,9 +67,7 @@ def test_section_is_that_of_the_cells(result, normal):
 
 
 def test_section_covers_the_plane_once_even_along_faces():
-    axes = (np.arange(k) + 0.5 for k in (3, 4, 2))
-    points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-    d = solids.solid_diagram((0, 0, 0), (3, 4, 2), points)
+    d = solids.cubes()
     for height in (0.5, 1.0, 1.0 + 1e-15, 2.0):
         _, polygons = cut_cells(d, np.array([0, 0, 1.0]), np.array([0, 0, height]))
         flat = flattened(polygons, (0, 0, 1))

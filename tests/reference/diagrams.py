@@ -34,19 +34,34 @@ def measures(polygon: np.ndarray) -> tuple[float, np.ndarray]:
     return float(area), origin + (cross[:, None] * (a + b)).sum(axis=0) / (6 * area)
 
 
+def second_moment(polygon, x):
+    """Integral of |y - x|^2 over a polygon: exact over triangles by the middles of their sides."""
+    total = 0.0
+    for a, b in zip(polygon, np.roll(polygon, -1, axis=0), strict=True):
+        area = ((a - x)[0] * (b - x)[1] - (a - x)[1] * (b - x)[0]) / 2
+        middles = np.array([(a + b) / 2, (a + x) / 2, (b + x) / 2])
+        total += area / 3 * ((middles - x) ** 2).sum()
+    return total
+
+
+def with_images(lower, upper, points: np.ndarray) -> np.ndarray:
+    """Return `points` (n, d) followed by their images in the walls of a box, wall by wall."""
+    found = [points]
+    for axis in range(points.shape[1]):
+        for wall in (lower[axis], upper[axis]):
+            image = points.copy()
+            image[:, axis] = 2 * wall - image[:, axis]
+            found.append(image)
+    return np.concatenate(found)
+
+
 def box_voronoi(lower, upper, points) -> list[Cell]:
     """Voronoi cells of `points` (n, 2) in a box, by Qhull on the points and their images in the four walls.
 
     A generator's image makes the wall its bisector. Walls are -1 (x lower), -2 (x upper), -3, -4.
     """
     points, n = np.asarray(points, float), len(points)
-    images = []
-    for axis in range(2):
-        for wall in (lower[axis], upper[axis]):
-            image = points.copy()
-            image[:, axis] = 2 * wall - image[:, axis]
-            images.append(image)
-    diagram = Voronoi(np.concatenate([points, *images]))
+    diagram = Voronoi(with_images(lower, upper, points))
     pairs, ridges = diagram.ridge_points, np.array(diagram.ridge_vertices)
     owners, others = np.concatenate([pairs, pairs[:, ::-1]]).T
     # Both ends of each face around its owner.

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import ConvexHull, Voronoi
 
+from tests.reference.diagrams import with_images
+
 LATTICES = {
     "cubic": [[0, 0, 0]],
     "bcc": [[0, 0, 0], [0.5, 0.5, 0.5]],
@@ -67,13 +69,7 @@ def box_voronoi(lower, upper, points) -> list[Cell]:
     A generator's image makes the wall its bisector. Points may not lie on walls.
     """
     points, n = np.asarray(points, float), len(points)
-    images = []
-    for axis in range(3):
-        for wall in (lower[axis], upper[axis]):
-            image = points.copy()
-            image[:, axis] = 2 * wall - image[:, axis]
-            images.append(image)
-    diagram = Voronoi(np.concatenate([points, *images]))
+    diagram = Voronoi(with_images(lower, upper, points))
     faces: list[dict] = [{} for _ in range(n)]
     centroids: list[dict] = [{} for _ in range(n)]
     tetrahedra: list[list] = [[] for _ in range(n)]

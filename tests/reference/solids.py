@@ -8,6 +8,7 @@ from scipy.spatial import Voronoi, cKDTree
 from clvoro.geometry.box import Box
 from clvoro.mesh.diagram import Diagram
 from clvoro.mesh.results import HISTORY_DTYPE, Result
+from tests.reference.diagrams import with_images
 
 
 def loop_area(corners):
@@ -23,6 +24,12 @@ def loop_centroid(corners):
     return (weights[:, None] * (a + b + c)).sum(axis=0) / (3 * weights.sum())
 
 
+def cubes(edge=1.0):
+    """Return the Diagram of 3 x 4 x 2 cubes."""
+    points = (np.stack(np.meshgrid(*map(np.arange, (3, 4, 2)), indexing="ij"), axis=-1).reshape(-1, 3) + 0.5) * edge
+    return solid_diagram((0, 0, 0), (3 * edge, 4 * edge, 2 * edge), points)
+
+
 def solid_diagram(lower, upper, points, shortest=1e-9):
     """Return the Diagram of `points` (n, 3) in a box, by Qhull on the points and their images in the six walls.
 
@@ -30,13 +37,7 @@ def solid_diagram(lower, upper, points, shortest=1e-9):
     """
     box = Box(lower, upper)
     points, n = np.asarray(points, float), len(points)
-    images = [points]
-    for axis in range(3):
-        for wall in (lower[axis], upper[axis]):
-            image = points.copy()
-            image[:, axis] = 2 * wall - image[:, axis]
-            images.append(image)
-    voronoi = Voronoi(np.concatenate(images))
+    voronoi = Voronoi(with_images(lower, upper, points))
     vertices = np.clip(voronoi.vertices, lower, upper)
     near = cKDTree(vertices).query_ball_point(vertices, shortest * box.extent.max())
     same = np.array([min(group) for group in near])

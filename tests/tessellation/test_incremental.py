@@ -103,6 +103,13 @@ def check(t, eps):
     assert np.allclose(near, np.linalg.norm(across, axis=1), rtol=1e-6, atol=32 * eps)
 
 
+def assert_only_short_faces_differ(t, expected, noise):
+    for a, b in ((t, expected), (expected, t)):
+        known = set(zip(b.owners.tolist(), b.neighbors.tolist(), strict=True))
+        faces = zip(a.owners.tolist(), a.neighbors.tolist(), a.face_measures, strict=True)
+        assert all(length < noise for i, j, length in faces if (i, j) not in known)
+
+
 @pytest.mark.sparse(6)
 @pytest.mark.parametrize("name", POINTS)
 @pytest.mark.parametrize("share", [0.0, 0.02, 0.3])
@@ -129,10 +136,7 @@ def test_update_gives_the_diagram_made_anew(engine, name, share, monkeypatch):
             assert eps > 1e-10 or name in ("lattice", "hexagons", "cocircular")
             noise = 256 * eps
             assert np.allclose(t.volumes, expected.volumes, rtol=1e-3 if share else 0, atol=noise)
-            for a, b in ((t, expected), (expected, t)):
-                known = set(zip(b.owners.tolist(), b.neighbors.tolist(), strict=True))
-                faces = zip(a.owners.tolist(), a.neighbors.tolist(), a.face_measures, strict=True)
-                assert all(length < noise for i, j, length in faces if (i, j) not in known)
+            assert_only_short_faces_differ(t, expected, noise)
     if share <= 0.02 and name not in ("clusters", "lattice", "cocircular"):
         # With few cells a change concerns too many of them.
         assert times == 10 if name != "wheel" else times >= 10 - 250 * share
@@ -479,10 +483,7 @@ def test_onto_a_lattice(engine, name, monkeypatch):
         check(t, eps)
         expected = carried.reference(points)
         assert t.volumes == pytest.approx(expected.volumes, abs=256 * eps)
-        for a, b in ((t, expected), (expected, t)):
-            known = set(zip(b.owners.tolist(), b.neighbors.tolist(), strict=True))
-            faces = zip(a.owners.tolist(), a.neighbors.tolist(), a.face_measures, strict=True)
-            assert all(length < 256 * eps for i, j, length in faces if (i, j) not in known)
+        assert_only_short_faces_differ(t, expected, 256 * eps)
         if was:
             assert not ((carried.incremental._fits.get() == 1) & ~fitting(t)).any()
     assert times == 4

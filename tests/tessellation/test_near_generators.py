@@ -192,6 +192,13 @@ kernel void probe(const int size, global const REAL *points, global const int4 *
 """
 
 
+def probe(engine, source, n, *arrays):
+    """Run the kernel `probe` of a source that uses half_planes.h."""
+    defines = ["-DDIM=2", f"-DREAL={'double' if engine.real == np.float64 else 'float'}"]
+    program = cl.Program(engine.ctx, source_text("tessellation/half_planes.h") + source).build(defines)
+    cl.Kernel(program, "probe")(engine.queue, (n,), None, np.int32(n), *(array.data for array in arrays))
+
+
 @pytest.mark.sparse(3)
 @pytest.mark.parametrize("real", ["float64", "float32"])
 @pytest.mark.parametrize("kind", ["far", "near", "circle", "lattice", "odd lattice"])
@@ -214,12 +221,8 @@ def test_the_side_of_a_corner(ctx, kind, real):
     # Walls, one across each axis.
     four[rng.random(n) < 0.3, 1] = -1 - rng.integers(0, 2)
     four[rng.random(n) < 0.3, 2] = -1 - rng.integers(2, 4)
-    program = cl.Program(ctx, source_text("tessellation/half_planes.h") + PROBE).build(
-        ["-DDIM=2", f"-DREAL={'double' if real == 'float64' else 'float'}"]
-    )
     places, numbers, found = engine.upload(x), engine.upload(four, np.int32), engine.empty(n)
-    kernel = cl.Kernel(program, "probe")
-    kernel(engine.queue, (n,), None, np.int32(n), places.data, numbers.data, found.data)
+    probe(engine, PROBE, n, places, numbers, found)
     zeros = 0
     for (i, a, b, j), side in zip(four.tolist(), found.get().tolist(), strict=True):
         truth, is_corner = exactly_beyond(x[i], *(label if label < 0 else x[label] for label in (a, b)), x[j])
@@ -284,12 +287,8 @@ def test_the_face_that_a_line_leaves_by(ctx, kind, real):
         x[:, 4] -= x[:, 3]
     x = x.astype(real)
     engine = Engine(ctx, cl.CommandQueue(ctx), 2, np.dtype(real))
-    program = cl.Program(ctx, source_text("tessellation/half_planes.h") + LATER).build(
-        ["-DDIM=2", f"-DREAL={'double' if real == 'float64' else 'float'}"]
-    )
     places, found = engine.upload(x), engine.empty(n)
-    kernel = cl.Kernel(program, "probe")
-    kernel(engine.queue, (n,), None, np.int32(n), places.data, found.data)
+    probe(engine, LATER, n, places, found)
     eps2 = Fraction(float(np.finfo(real).eps)) ** 2
     signs = []
     for places, later in zip(x, found.get().tolist(), strict=True):
