@@ -5,7 +5,7 @@
 
 For each number of ranks the script starts itself under `mpiexec`; with PoCL each rank has one core. `bits` says whether
 the diagram of random points has the same bits as with the first number of ranks. The other columns are of a run in a
-box, on a sphere, or in a lake, with sizes from h to 3 h, after a run of fewer cells, which builds kernels. `CPU s` is
+box, on a sphere, or in a lake, with sizes from h to 3 h, after the same run once, which loads kernels. `CPU s` is
 the processor time of its work, summed over ranks, and `over one` the ratio to that of the first number of ranks.
 `waiting` is the processor time of waits for other ranks, which ask and sleep by turns; ranks with a core of their own
 wait less. `reading` is that of reading the cells afterwards. `floor` is the ratio for as many processes at the same
@@ -135,7 +135,7 @@ def measure_rank(options: argparse.Namespace) -> None:
         waits = waited[0] - waits
         return mesh, comm.allreduce(time.process_time() - began - waits), comm.allreduce(waits)
 
-    run(adapter, 2 * h)  # builds kernels
+    run(adapter, h)
     single = clvoro.Adapter(adapter.ctx, options.dtype, comm=MPI.COMM_SELF)
     run(single, 4 * h)
     least = run(single, h * comm.size ** (1 / dim))[1]

@@ -87,13 +87,14 @@ kernel void place_unfolded(const int size, global const REAL *points, const REAL
    many have moved too far; and how many neighbors are half a period away or farther. Over all parts the second sum is
    zero if each face has both sides. One work-item per t; `size` is a multiple of GROUP_SIZE.
 
-   needed[i] is the radius above. When generator i was at at[i], its part knew all generators within limits[i].s0 of it,
-   and it was at least limits[i].s1 away from the balls of other parts that do not know it. */
+   needed[i] is the radius above, and how far generator i has moved. When generator i was at at[i], its part knew all
+   generators within limits[i].s0 of it, and it was at least limits[i].s1 away from the balls of other parts that do not
+   know it. */
 kernel void sum_cells(const int size, const int n, const int rows, global const int *convex_starts,
                       global const int *convex_neighbors, global const int *starts, global const int *neighbors,
                       global const int *labels, global const FACE *face_measures, global const REAL *volumes,
                       const int with_ghosts, const REAL factor, global const float *reach, global const REAL *points,
-                      global const REAL *at, global const float2 *limits, global float *needed, const REAL4 periods,
+                      global const REAL *at, global const float2 *limits, global float2 *needed, const REAL4 periods,
                       global REAL *sums)
 {
     WORK_ITEM(t);
@@ -108,7 +109,7 @@ kernel void sum_cells(const int size, const int n, const int rows, global const 
         const REAL moved = sqrt(moved2);
         const REAL radius =
             certified_radius(i, n, rows, with_ghosts, factor, convex_starts, convex_neighbors, reach, points);
-        needed[i] = (float)(radius * (1 + R(1e-6)));
+        needed[i] = (float2)((float)(radius * (1 + R(1e-6))), (float)(moved * (1 + R(1e-6))));
         small += !(radius + moved <= limits[i].s0);
         beyond += !(moved <= limits[i].s1);
         volume += volumes[i];

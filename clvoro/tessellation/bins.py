@@ -152,6 +152,10 @@ class Bins:
         """
         engine, k, d = self.engine, self._kernels, self.engine.dim
         lower, upper = (corner.astype(np.float64)[:d] for corner in box.device_corners(engine.real))
+        if n and engine.peers.count > 1:
+            # A part of a domain fills a part of the box.
+            x = np.ascontiguousarray(points[:n].get().T[:d], np.float64)
+            lower, upper = x.min(axis=1), x.max(axis=1)
         edge = root_edge(upper - lower, n)
         sides = np.maximum(1, np.ceil((upper - lower) / edge).astype(int))
         root_bins = int(np.prod(sides)) + 1

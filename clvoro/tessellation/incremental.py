@@ -17,8 +17,9 @@ from .cells import Cells, FaceRows, most_faces, spare_slots, verdict
 from .device_diagram import Follow, Tessellation, read_report
 from .report import DOUBT, LISTED, SIZE, UNFINISHED, WRONG, with_room
 
-MAX_ROUNDS = 6
-"""Most rounds of clipping and checking; after that the diagram is built from scratch."""
+MAX_ROUNDS = 8
+"""Most rounds of clipping and checking, as many as a report has room for; after that the diagram is built from scratch.
+"""
 MAX_SHARE = 0.4
 """Largest share of cells to clip in the first round. Beyond it a new diagram costs less."""
 AGAIN_SHARE = 0.1

@@ -197,8 +197,8 @@ class Part:
           it within which all generators are known, and how far the generator may move from it.
         - `factor`: radius of the ball in which all generators must be known, over the reach of a cell.
         - `with_ghosts`: whether the cells of ghosts beside own cells must be final, too.
-        - `needed` (n_own,) float32: receives the radii of the balls around own generators in which all generators must
-          be known.
+        - `needed` (n_own, 2) float32: receives the radii of the balls around own generators in which all generators
+          must be known, and how far these have moved.
         - `periods` (4,) real: lengths of the periods; 0 between walls.
 
         The result is (6,) ndarray: the volume of own cells; the signed sum of the measures of their faces with ghosts;

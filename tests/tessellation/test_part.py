@@ -137,8 +137,6 @@ def test_diagrams_of_two_halves_have_the_bits_of_the_whole(ctx, dim, real, whole
     for name in ("volumes", "offsets", "covariances"):
         differ = halves.joined([getattr(found, name) for found in two]) != getattr(one, name)
         same &= ~differ.reshape(len(differ), -1).any(axis=1)
-    # In single precision round-off may decide whether a cell has a face of no area: such a cell is not measured again.
-    assert np.count_nonzero(~same) <= (3 if (dim, real) == (3, np.float32) else 0)
     across = (one.owners < halves.bounds[1]) != (one.neighbors < halves.bounds[1])
     assert np.count_nonzero(across & (one.neighbors >= 0)) > 40
     # Against the order in which cells are clipped: neighbors are the same, measures differ by round-off.
@@ -147,9 +145,10 @@ def test_diagrams_of_two_halves_have_the_bits_of_the_whole(ctx, dim, real, whole
     for i in np.flatnonzero(same):
         row, other = (d.neighbors[d.starts[i] : d.starts[i + 1]] for d in (one, plain))
         names = np.where(row < 0, row, halves.labels[row])
-        assert names.argmin() == 0
         assert np.array_equal(np.sort(row), np.sort(other))
-        assert dim == 2 or np.array_equal(names, np.sort(names))
+        same[i] = names.argmin() == 0 and (dim == 2 or np.array_equal(names, np.sort(names)))
+    # In single precision round-off may decide whether a cell has a face of no area: such a cell is not measured again.
+    assert np.count_nonzero(~same) <= (3 if (dim, real) == (3, np.float32) else 0)
     noise = 1e3 * np.finfo(real).eps
     assert np.abs(one.volumes - plain.volumes).max() < noise * one.volumes.max()
     assert np.abs(one.covariances - plain.covariances).max() < noise
