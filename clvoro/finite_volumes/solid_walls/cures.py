@@ -57,7 +57,7 @@ _OBLIQUE = 100
 """Most searches at oblique faces, besides one for each cell that has such faces."""
 _AHEAD = 1
 """Where no cure of a cell helps, cures of the cells that OpenFOAM rejects after it may follow: how many in turn."""
-_BRANCHES, _MORE_BRANCHES, _MOST_BAD = 2, 6, 3
+_BRANCHES, _MOST_BAD = 2, 3
 """After how many of the cures of a cell others are tried, of those with oblique faces that are left then, and for how
 many rejected cells."""
 
@@ -79,7 +79,6 @@ class Cures:
     - `edits`: the mesh with all changes that are kept.
     - `searches`: how often cures have been tried on a cell, also by the earlier cures.
     - `most`: the number of searches after which no cure is tried.
-    - `branches`: after how many of the cures of a cell others are tried.
     """
 
     def __init__(
@@ -93,7 +92,7 @@ class Cures:
     ) -> None:
         self.surface, self.edits, self.names, self.sizes = surface, Edits(faces), names, sizes
         self.changes, self.searches, self.changed, self.tried = 0, 0, dict[int, int](), dict[int, int]()
-        self.most, self.branches, self.strictly = _MOST, _BRANCHES, strictly
+        self.most, self.strictly = _MOST, strictly
         self.excess: dict[int, tuple[int, float]] = {}
         self.judged: dict[tuple[Edits, int, bool], list[Option]] = {}
         if earlier is not None:
@@ -142,8 +141,6 @@ class Cures:
 
     def work_on(self, cells: list[int]) -> None:
         """Cure these cells, and those that cures change, until no cure helps any more."""
-        if self.strictly:
-            self.tried.clear()
         self.most = min(self.most, self.searches + _EACH * len(cells))
         todo, again = cells, True
         while again:
@@ -194,7 +191,7 @@ class Cures:
             return gain, trial
         if not ahead:
             return None
-        for gain, trial, bad in sorted(options, key=lambda o: o[0][1])[: self.branches]:
+        for gain, trial, bad in sorted(options, key=lambda o: o[0][1])[:_BRANCHES]:
             for c in bad[:_MOST_BAD]:
                 if trial.faces_of(c) and (further := self._best(trial, c, ahead - 1, last)) is not None:
                     gain = (gain[0] + further[0][0], gain[1] + further[0][1], max(gain[2], further[0][2]))
@@ -275,15 +272,10 @@ class Cures:
                         yield trial
                         break
 
-    def _on_surface(self, edits: Edits, cell: int, a: int, b: int, x: np.ndarray) -> np.ndarray:
-        """Return x on the edge from a to b, moved onto the patch or crease that has the edge."""
-        found = self._placed(edits.patches_at(cell, a, b), x, self.h(edits, cell))
-        return x if found is None else found
-
-    def _placed(self, walls: set[int], x: np.ndarray, h: float) -> np.ndarray | None:
-        """Return x moved onto all of the `walls` (negative numbers), or None if they do not meet near it."""
-        fits, places = self._all_placed([walls], x[None], h)
-        return places[0] if fits[0] else None
+    def _on_surface(self, edits: Edits, cell: int, edges: list[Edge], x: np.ndarray) -> np.ndarray:
+        """Return x (k, 3) on `edges` of a cell moved onto the patches or creases that have the edges."""
+        fits, places = self._all_placed([edits.patches_at(cell, *e) for e in edges], x, self.h(edits, cell))
+        return np.where(fits[:, None], places, x)
 
     def _all_placed(self, walls: list[set[int]], x: np.ndarray, h: float) -> tuple[np.ndarray, np.ndarray]:
         """Return for each of the points x (k, 3) whether its `walls` meet near it, and the place there, (k, 3)."""
@@ -363,13 +355,16 @@ class Cures:
 
     def tilts(self, edits: Edits, cell: int) -> Iterator[Edits]:
         """Turn an oblique face of a cell, about its center or a corner, towards the line through both centroids."""
-        center = self._center(edits, cell)
-        for k in edits.faces_of(cell):
+        faces = edits.faces_of(cell)
+        beyond = [n for n in (edits.across(k, cell) for k in faces) if n >= 0 and not edits.is_vast(n)]
+        center, *centers = edits.middles([(edits, n) for n in (cell, *beyond)])[:, :3]
+        center_of = dict(zip(beyond, centers, strict=True))
+        for k in faces:
             other, loop = edits.across(k, cell), edits.seen(k, cell)
-            if other < 0 or edits.is_vast(other):
+            if other not in center_of:
                 continue
             x = edits.positions(loop)
-            normal, line = area_of(x), self._center(edits, other) - center
+            normal, line = area_of(x), center_of[other] - center
             normal, line = normal / np.linalg.norm(normal), line / np.linalg.norm(line)
             if normal @ line > math.cos(math.radians(WANTED_ANGLE)):
                 continue
@@ -463,26 +458,8 @@ class Cures:
         return cell >= edits.mesh.n_cells or self._volume(edits, cell) < _SMALL * self.h(edits, cell) ** 3
 
     @staticmethod
-    def _center(edits: Edits, cell: int) -> np.ndarray:
-        """Return the centroid of a cell."""
-        loops = [edits.positions(edits.seen(k, cell)) for k in edits.faces_of(cell)]
-        middles = [x.mean(axis=0) for x in loops]
-        apex, total, weight = np.mean(middles, axis=0), np.zeros(3), 0.0
-        for x, middle in zip(loops, middles, strict=True):
-            after = np.roll(x, -1, axis=0)
-            volumes = np.einsum("ij,ij->i", np.cross(x - apex, after - apex), (middle - apex)[None]) / 6
-            total += (volumes[:, None] * (x + after + middle + apex)).sum(axis=0) / 4
-            weight += volumes.sum()
-        return total / weight
-
-    @staticmethod
     def _volume(edits: Edits, cell: int) -> float:
-        """Return the volume of a cell with faces that are nearly flat."""
-        total = 0.0
-        for k in edits.faces_of(cell):
-            x = edits.positions(edits.seen(k, cell))
-            total += float(x[0] @ area_of(x))
-        return total / 3
+        return float(edits.middles([(edits, cell)])[0, 3])
 
 
 def _collapse(edits: Edits, cell: int, vertices: list[int], target: np.ndarray) -> None:
@@ -571,9 +548,8 @@ def cured(
     begun = (rejected if oblique is None else oblique).tolist()
     cures = Cures(surface, faces, names, sizes, earlier, oblique is not None)
     if oblique is not None:
-        cures.most = _OBLIQUE + len(begun)
-    for cures.branches in (_BRANCHES,) if oblique is None else (_BRANCHES, _MORE_BRANCHES):
-        cures.work_on(begun)
+        cures.most = cures.searches + _OBLIQUE + len(begun)
+    cures.work_on(begun)
     made, cells, left = cures.result(rejected)
     if len(left) > len(rejected):
         return faces, np.arange(faces.n_cells), own, rejected, None

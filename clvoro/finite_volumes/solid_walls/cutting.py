@@ -71,7 +71,7 @@ class CellCut:
         self.least = 1e-9 * near
         self.parts: dict[int, list[tuple[int, ...]]] = {}  # of faces
 
-    def make(self, onto: Callable[[Edits, int, int, int, np.ndarray], np.ndarray]) -> bool:
+    def make(self, onto: Callable[[Edits, int, list[Edge], np.ndarray], np.ndarray]) -> bool:
         """Cut the cell; return whether it falls into two parts. If not, the changes are of no use.
 
         `onto` returns a place on an edge of a cell moved onto the walls that have the edge.
@@ -129,10 +129,11 @@ class CellCut:
         return list(zip(keys[::2], keys[1::2], strict=True))
 
     def _vertices(
-        self, path: list[tuple[int, Edge, Edge]], onto: Callable[[Edits, int, int, int, np.ndarray], np.ndarray]
+        self, path: list[tuple[int, Edge, Edge]], onto: Callable[[Edits, int, list[Edge], np.ndarray], np.ndarray]
     ) -> dict[Edge, int]:
         """Return the vertex of the section on each edge: its upper end if that is in the plane, or a new one."""
         found: dict[Edge, int] = {}
+        ends, places = list[Edge](), list[np.ndarray]()
         for _, key, _ in path:
             p, q = key if key[0] in self.up else key[::-1]
             if p in self.flat:
@@ -140,8 +141,11 @@ class CellCut:
             else:
                 high, deep = max(self.heights[p], self.least), max(-self.heights[q], self.least)
                 share = high / (high + deep)
-                place = (1 - share) * self.edits.point(p) + share * self.edits.point(q)
-                found[key] = self.edits.divide_edge(self.cell, p, q, onto(self.edits, self.cell, p, q, place))
+                ends.append((p, q))
+                places.append((1 - share) * self.edits.point(p) + share * self.edits.point(q))
+        if ends:
+            for (p, q), x in zip(ends, onto(self.edits, self.cell, ends, np.array(places)), strict=True):
+                found[min(p, q), max(p, q)] = self.edits.divide_edge(self.cell, p, q, x)
         return found
 
     def _divide(self, k: int, i: int, j: int) -> list[int] | None:

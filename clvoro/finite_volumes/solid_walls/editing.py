@@ -8,12 +8,14 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterable, Iterator
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
 from ...mesh.connectivity import take_rows
 from ...mesh.faces import Faces
+from ...mesh.geometry import cell_geometry, face_geometry
 from ..gate import LEAST_DETERMINANT, LEAST_MEASURE
 from ..measures import SolverMeasures
 
@@ -52,6 +54,7 @@ class Edits:
         self.touched: set[int] = set()
         self.taken: list[Edits] = []
         self.origins: dict[int, int] = {} if parent is None else dict(parent.origins)
+        self._middles: dict[int, np.ndarray] = {}
         if parent is None:
             self.next_face, self.next_cell, self.next_point = len(mesh), mesh.n_cells, len(mesh.points)
             starts, places = mesh.cell_faces()
@@ -84,6 +87,9 @@ class Edits:
         self._cells |= trial._cells
         self._points |= trial._points
         self.touched |= trial.touched
+        for c in trial.touched:
+            self._middles.pop(c, None)
+        self._middles |= trial._middles
         self.origins = trial.origins
         self.next_face, self.next_cell, self.next_point = trial.next_face, trial.next_cell, trial.next_point
 
@@ -171,6 +177,34 @@ class Edits:
         """Return the vertices of a cell."""
         return {v for k in self.faces_of(cell) for v in self.face(k)[2]}
 
+    @staticmethod
+    def middles(cells: list[tuple[Edits, int]]) -> np.ndarray:
+        """Return centroid and volume of each of some cells in some edits, (k, 4) float. Each is computed once."""
+        found = list[tuple[Edits, int]]()
+        for at, cell in cells:
+            while at.parent is not None and cell not in at.touched:
+                at = at.parent
+            found.append((at, cell))
+        new = list({(at, c): None for at, c in found if c not in at._middles})
+        if new:
+            sides = [(row, *loop) for row, (at, c) in enumerate(new) for loop in at._loops(c)]
+            counts = [len(x) for _, _, x in sides]
+            center, area = face_geometry(
+                np.concatenate([x for _, _, x in sides]), np.cumsum([0, *counts]), np.arange(sum(counts))
+            )
+            area *= np.array([sign for _, sign, _ in sides])[:, None]
+            owner = np.array([row for row, _, _ in sides])
+            made = np.column_stack(cell_geometry(center, area, owner, owner[:0], len(new)))
+            for (at, c), row in zip(new, made, strict=True):
+                at._middles[c] = row
+        return np.array([at._middles[c] for at, c in found]).reshape(-1, 4)
+
+    def _loops(self, cell: int) -> Iterator[tuple[float, np.ndarray]]:
+        """Return the corners of each face of a cell, (k, 3), after the sign of its normal."""
+        for k in sorted(self.faces_of(cell)):
+            owner, _, loop = self.face(k)
+            yield 1.0 if owner == cell else -1.0, self.positions(loop)
+
     def faces_at(self, cell: int, *vertices: int) -> dict[int, set[int]]:
         """Return the faces that have all of `vertices`, for each cell with such faces; they lead there from `cell`."""
         found: dict[int, set[int]] = {}
@@ -245,19 +279,16 @@ class Edits:
 
     def is_sound(self, cell: int) -> bool:
         """Return whether the faces of a cell close it: each edge has two of them, and no face a corner twice."""
-        faces = self.faces_of(cell)
-        if not faces:
-            return True
-        seen: set[tuple[int, int]] = set()
+        faces, edges = self.faces_of(cell), list[Edge]()
         for k in faces:
-            loop = self.seen(k, cell)
-            if len(loop) < 3 or len(set(loop)) < len(loop) or self.across(k, cell) == cell:
+            owner, neighbor, loop = self.face(k)
+            if owner == neighbor or len(loop) < 3 or len(set(loop)) < len(loop):
                 return False
-            for edge in edges_of(loop):
-                if edge in seen:
-                    return False
-                seen.add(edge)
-        return len(faces) > 3 and all((b, a) in seen for a, b in seen)
+            after = loop[1:] + loop[:1]
+            edges += zip(loop, after, strict=True) if owner == cell else zip(after, loop, strict=True)
+        once = set(edges)
+        closed = len(once) == len(edges) and all((b, a) in once for a, b in once)
+        return not faces or (len(faces) > 3 and closed)
 
     def repeat(self, other: Edits, matches: Matches) -> dict[int, int]:
         """Repeat the changes that other edits have made to their mesh, in the cells that both meshes share.
@@ -429,14 +460,15 @@ def judge(trials: list[tuple[Edits, list[int]]], strictly: bool = False) -> list
     With `strictly`, faces count, too, that are more oblique or skewed than wanted, far less than what is rejected.
     """
     regions: dict[tuple[Edits, tuple[int, ...]], _Region] = {}
-    parts, points = list[_Region](), list[np.ndarray]()
+    parts, points, beside = list[_Region](), list[np.ndarray](), list[tuple[Edits, int]]()
     for edits, chosen in trials:
         key = edits.shape(), tuple(chosen)
         if key not in regions:
             regions[key] = _region(*key)
         parts.append(regions[key])
         points.append(edits.positions(parts[-1].vertices))
-    begun = np.cumsum([0, *(p.n_cells for p in parts)])
+        beside += [(edits, c) for c in parts[-1].beside]
+    begun = np.cumsum([0, *(len(c) + len(p.beside) for (_, c), p in zip(trials, parts, strict=True))])
     cells, faces, corners = int(begun[-1]), [len(p.owner) for p in parts], [len(p.corners) for p in parts]
     one = np.concatenate([p.owner for p in parts]) + np.repeat(begun[:-1], faces)
     other = np.concatenate([p.neighbor for p in parts])
@@ -461,17 +493,18 @@ def judge(trials: list[tuple[Edits, list[int]]], strictly: bool = False) -> list
     rows = np.concatenate([k + np.arange(len(chosen)) for k, (_, chosen) in zip(begun.tolist(), trials, strict=False)])
     mine = np.zeros(cells, bool)
     mine[rows] = True
-    excess, worst = _measured(mesh, mine, strictly)
+    excess, worst = _measured(mesh, mine, Edits.middles(beside), strictly)
     ends = np.cumsum([len(chosen) for _, chosen in trials])[:-1]
     return list(zip(np.split(np.round(excess[rows], 6), ends), np.split(worst[rows], ends), strict=True))
 
 
 class _Region(NamedTuple):
-    """Some cells and, with higher numbers, their neighbors; those behind these are left out.
+    """The faces of some cells. Their neighbors have higher numbers.
 
     - `owner`, `neighbor`, `counts` (f,) int: the cells of each face and the number of its corners.
     - `corners` (k,) int: rows of `vertices`.
     - `vertices`: their numbers in the mesh.
+    - `beside`: the neighbors.
     """
 
     owner: np.ndarray
@@ -479,22 +512,20 @@ class _Region(NamedTuple):
     counts: np.ndarray
     corners: np.ndarray
     vertices: list[int]
-    n_cells: int
+    beside: list[int]
 
 
 def _region(edits: Edits, cells: tuple[int, ...]) -> _Region:
-    """Return some cells with their neighbors."""
+    """Return the faces of some cells."""
     number = {c: k for k, c in enumerate(cells)}
-    for c in cells:
-        for n in edits.neighbors(c):
-            if not edits.is_vast(n):
-                number.setdefault(n, len(number))
     owner, neighbor, counts, corners = list[int](), list[int](), list[int](), list[int]()
-    for k in set().union(*(edits.faces_of(c) for c in number)):
+    for k in set().union(*map(edits.faces_of, cells)):
         i, j, loop = edits.face(k)
-        if i not in number:
+        if i not in number and edits.is_vast(i):
             i, j, loop = j, -1, loop[::-1]
-        a, b = number[i], number.get(j, -1)
+        elif j >= 0 and j not in number and edits.is_vast(j):
+            j = -1
+        a, b = number.setdefault(i, len(number)), j if j < 0 else number.setdefault(j, len(number))
         if 0 <= b < a:
             a, b, loop = b, a, loop[::-1]
         owner.append(a)
@@ -502,7 +533,8 @@ def _region(edits: Edits, cells: tuple[int, ...]) -> _Region:
         counts.append(len(loop))
         corners += loop
     vertices, rows = np.unique(np.array(corners, np.int64), return_inverse=True)
-    return _Region(*(np.array(x, np.int64) for x in (owner, neighbor, counts)), rows, vertices.tolist(), len(number))
+    made = (np.array(x, np.int64) for x in (owner, neighbor, counts))
+    return _Region(*made, rows, vertices.tolist(), list(number)[len(cells) :])
 
 
 def over_wanted(measures: SolverMeasures) -> np.ndarray:
@@ -510,19 +542,24 @@ def over_wanted(measures: SolverMeasures) -> np.ndarray:
     return np.maximum(measures.non_orthogonality / WANTED_ANGLE, measures.skewness / WANTED_SKEWNESS)
 
 
-def _measured(mesh: Faces, mine: np.ndarray, strictly: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Return excess and worst as `judge` does, (n,) each, right for the cells that are `mine` (n,) bool."""
+def _measured(mesh: Faces, mine: np.ndarray, others: np.ndarray, strictly: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Return excess and worst as `judge` does, (n,) each, right for the cells that are `mine` (n,) bool.
+
+    `others` (k, 4) are centroids and volumes of the other cells, of which the mesh has some faces only.
+    """
     m, g, n = mesh.measures, mesh.measures.geometry, mesh.n_cells
+    centroids, volumes = g.centroids.copy(), g.volumes.copy()
+    centroids[~mine], volumes[~mine] = others[:, :3], others[:, 3]
+    m.geometry = g = replace(g, centroids=centroids, volumes=volumes)
     c = m.coupled
     inner = mesh.neighbor >= 0
-    judged = np.flatnonzero(mine[mesh.owner] | (inner & mine[mesh.neighbor]))
     worst = np.maximum(m.skewness / 4, m.non_orthogonality / 90)
     worst[c] = np.maximum(worst[c], 0.05 / np.maximum(m.weight[c], 1e-3))
     worst[c] = np.maximum(worst[c], 0.01 / np.maximum(m.volume_ratio[c], 1e-3))
     wrong = np.clip(worst - 1, 0, 3)
     wrong += (worst > 1) | (m.pyramids < -1e-15)
     wrong += np.linalg.norm(g.areas, axis=1) < LEAST_MEASURE
-    wrong[judged] += m.bad_tetrahedra_of(judged)
+    wrong += m.bad_tetrahedra
     excess, most = np.zeros(n), np.zeros(n)
     for cells, rows in ((mesh.owner, slice(None)), (mesh.neighbor[inner], inner)):
         excess += np.bincount(cells, wrong[rows], n)

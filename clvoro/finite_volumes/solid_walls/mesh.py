@@ -232,7 +232,7 @@ class _Trials:
     ) -> None:
         self.surface, self.points, self.sizes, self.whole = surface, points, sizes, whole
         self.tell, self.held, self.straight = tell, held, straight
-        self._tree = scipy.spatial.KDTree(points)
+        self._tree, self._turned = scipy.spatial.KDTree(points), None
 
     def best(self) -> _Made:
         """Return the mesh with the fewest rejected cells, then the least oblique faces."""
@@ -287,6 +287,7 @@ class _Trials:
     def _remade(self, state: np.ndarray, last: _Made | None) -> _Made | None:
         """Return the mesh of a state, if there is one. What it shares with the `last` mesh is taken from there."""
         points, near = state[:, :3], None if last is None else last.near
+        self.surface.recall()
         if last is not None and last.cures is not None and last.cures.are_spent:
             return None
         if near is None or not np.array_equal(near.points, points):
@@ -313,8 +314,8 @@ class _Trials:
         if not len(oblique):
             return made
         names, h = near.numbers[made.home], near.sizes[made.home]
-        faces, origin, own, rejected, _ = cured(
-            self.surface, made.faces, names, made.own, h, made.rejected, oblique=oblique
+        faces, origin, own, rejected, self._turned = cured(
+            self.surface, made.faces, names, made.own, h, made.rejected, self._turned, oblique
         )
         return replace(made, faces=faces, home=made.home[origin], own=own, rejected=rejected)
 

@@ -103,6 +103,7 @@ def _divide(
     the face falls into parts. Chords near the surface are the right ones.
     """
     faces, lists, chords = [], [], []
+    cut: list[tuple[int, list[np.ndarray], np.ndarray, np.ndarray]] = []
     for row in rows.tolist():
         begin, end = whole.starts[row], whole.starts[row + 1]
         items, gap = whole.items[begin:end], whole.chord[begin:end]
@@ -110,12 +111,15 @@ def _divide(
         items, gap = np.roll(items, -first), np.roll(gap, -first)
         last = np.flatnonzero(gap)  # places of the ends of runs
         runs = np.split(items, last[:-1] + 1)
-        g = len(runs)
         ends, heads = points[items[last]], points[[run[0] for run in runs]]
-        middle = (ends[:, None] + heads[None]) / 2
-        depth = np.abs(surface.closest(middle.reshape(-1, 3))[2]).reshape(g, g)
         # A chord is as long as it must be: among equally deep ones the shorter.
-        depth += 0.05 * np.linalg.norm(ends[:, None] - heads[None], axis=2)
+        longer = 0.05 * np.linalg.norm(ends[:, None] - heads[None], axis=2)
+        cut.append((row, runs, (ends[:, None] + heads[None]) / 2, longer))
+    middles = np.concatenate([middle.reshape(-1, 3) for _, _, middle, _ in cut])
+    depths = np.split(np.abs(surface.closest(middles)[2]), np.cumsum([longer.size for *_, longer in cut])[:-1])
+    for (row, runs, _, longer), depth in zip(cut, depths, strict=True):
+        g = len(runs)
+        depth = depth.reshape(g, g) + longer
         following_run = _best_pairing(depth)
         left = set(range(g))
         while left:

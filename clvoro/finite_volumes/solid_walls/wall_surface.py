@@ -20,6 +20,8 @@ SNAP_CREASE = 0.06
 """Wall vertices this close to a crease, as a share of h, are moved onto it."""
 SNAP_CORNER = 0.12
 """The same for corners."""
+_FEW, _MOST_KEPT = 64, 1 << 19
+"""Answers for fewer points at a time are not kept; how many are, at most."""
 
 
 class WallSurface:
@@ -41,6 +43,9 @@ class WallSurface:
         self.n_patches = solid.n_patches
         self.ends = self.vertices[solid.creases.edges]  # (e, 2, 3)
         self.corners = self.vertices[solid.corners]
+        self._kept = list[tuple[np.ndarray, ...]]()
+        nothing = np.full((1, 3), np.nan)
+        self._known = np.zeros(1, np.int64), nothing, np.zeros(1, np.int64), nothing, np.zeros(1)
 
     @property
     def first_corner(self) -> int:
@@ -62,11 +67,32 @@ class WallSurface:
 
     def closest(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the closest triangle (k,), the point on it (k, 3), and the distance (k,), negative inside."""
-        return self.solid.closest(points, self._triangles(points))
+        if len(points) < _FEW:
+            return self.solid.closest(points, self._triangles(points))
+        key = _keys(points)
+        keys, known, *answers = self._known
+        row = np.minimum(np.searchsorted(keys, key), len(keys) - 1)
+        new = np.flatnonzero((keys[row] != key) | (known[row] != points).any(axis=1))
+        found = tuple(answer[row] for answer in answers)
+        if len(new):
+            asked = points[new]
+            for answer, made in zip(found, self.solid.closest(asked, self._triangles(asked)), strict=True):
+                answer[new] = made
+        self._kept += [(points, *found)] if sum(len(x) for x, *_ in self._kept) < _MOST_KEPT else []
+        return found
+
+    def recall(self) -> None:
+        """Let `closest` take what it has found since the last call from there, and forget what it had found before."""
+        if self._kept:
+            points, *answers = (np.concatenate(parts) for parts in zip(*self._kept, strict=True))
+            key = _keys(points)
+            order = np.argsort(key)
+            self._known = key[order], points[order], *(answer[order] for answer in answers)
+            self._kept = []
 
     def feet(self, points: np.ndarray) -> np.ndarray:
         """Return the closest point of the surface to each of `points` (k, 3), (k, 3)."""
-        return self.solid.feet(points, triangles=self._triangles(points)).point
+        return self.closest(points)[1]
 
     def _triangles(self, points: np.ndarray) -> np.ndarray | None:
         return None if self._nearest is None else self._nearest(points, np.inf)
@@ -162,6 +188,12 @@ class WallSurface:
         number, least = np.bincount(shared // self.n_patches, minlength=len(keys)), np.full(len(keys), -1)
         least[(shared // self.n_patches)[::-1]] = (shared % self.n_patches)[::-1]
         return number[place], least[place]
+
+
+def _keys(points: np.ndarray) -> np.ndarray:
+    """Return a number for each of `points` (k, 3) that few others have, (k,) int."""
+    bits = np.ascontiguousarray(points, float).view(np.int64)
+    return (bits * np.array([-7046029254386353131, -4417276706812531889, 1609587929392839161])).sum(axis=1)
 
 
 def nearest(tree: scipy.spatial.KDTree, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
