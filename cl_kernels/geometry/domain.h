@@ -34,11 +34,6 @@
 #define reflect_inside reflect_inside_box
 #endif
 
-/* Corners of the box as arrays. */
-#define BOX_CORNERS(lower, upper)                                                                                      \
-    const REAL lower[4] = {box_lower.s0, box_lower.s1, box_lower.s2, box_lower.s3};                                    \
-    const REAL upper[4] = {box_upper.s0, box_upper.s1, box_upper.s2, box_upper.s3}
-
 #ifdef PERIODIC
 /* Length of the period along axis a, where positions lie in [0, period); 0 between walls. In the unit box positions and
    periods are multiples of eps, so differences to any image are exact. */

@@ -1,6 +1,11 @@
 /* The position of a generator as the origin of the plane in which its cell is cut. */
 #include "geometry/weights.h"
 
+/* Corners of the box as arrays. */
+#define BOX_CORNERS(lower, upper)                                                                                      \
+    const REAL lower[4] = {box_lower.s0, box_lower.s1, box_lower.s2, box_lower.s3};                                    \
+    const REAL upper[4] = {box_upper.s0, box_upper.s1, box_upper.s2, box_upper.s3}
+
 #ifdef SPHERE
 /* A generator on the unit sphere as the origin of a plane: its tangent plane, onto which the sphere is projected from
    its center. Great circles become straight lines, so cells become convex polygons. A site holds the position of the

@@ -30,20 +30,17 @@ kernel void find_largest_weight(int n, global const int *starts, global const SO
 
 /* out[k] = 2^exponent weights[k], in the multigrid's precision, whose range may be smaller than the operator's. One
    work-item per entry. */
-kernel void scale_weights(int m, int exponent, global const SOURCE *weights, global REAL *out)
+kernel void scale_weights(int size, int exponent, global const SOURCE *weights, global REAL *out)
 {
-    const int k = get_global_id(0);
-    if (k < m)
-        out[k] = (REAL)ldexp(weights[k], exponent);
+    WORK_ITEM(k);
+    out[k] = (REAL)ldexp(weights[k], exponent);
 }
 
 /* inverse[i] = 1 / sum_j w_ij, or 0 if the sum is 0. */
-kernel void invert_row_sums(int n, global const int *starts, global const int *columns, global const REAL *weights,
+kernel void invert_row_sums(int size, global const int *starts, global const int *columns, global const REAL *weights,
                             global REAL *inverse)
 {
-    const int i = get_global_id(0);
-    if (i >= n)
-        return;
+    WORK_ITEM(i);
     REAL sum = 0;
     for (int k = starts[i]; k < starts[i + 1]; ++k)
         if (columns[k] != i)
@@ -67,19 +64,17 @@ inline REAL break_tie(REAL weight, int i, int j)
    Only cells without a mate choose. They choose among neighbors without a mate (`matched` 0) or with one (1). The
    strength is symmetric, and independent of position on a mesh whose weights grow steadily. By weight alone all cells
    of such a mesh would choose in the direction of growth, and few pairs would form. */
-kernel void choose_neighbor(int n, int matched, global const int *starts, global const int *columns,
+kernel void choose_neighbor(int size, int matched, global const int *starts, global const int *columns,
                             global const REAL *weights, global const REAL *inverse_sums, global const int *mate,
                             global int *choice)
 {
-    const int i = get_global_id(0);
-    if (i >= n)
-        return;
+    WORK_ITEM(i);
     int best = NONE;
     if (mate[i] == NONE) {
         REAL most = 0;
         for (int k = starts[i]; k < starts[i + 1]; ++k) {
             const int j = columns[k];
-            if (j < 0 || j >= n || j == i || (mate[j] != NONE) != matched)
+            if (j < 0 || j >= size || j == i || (mate[j] != NONE) != matched)
                 continue;
             const REAL p = break_tie(weights[k] * (inverse_sums[i] + inverse_sums[j]), i, j);
             if (p > most) {
@@ -92,11 +87,9 @@ kernel void choose_neighbor(int n, int matched, global const int *starts, global
 }
 
 /* mate[i] = j and mate[j] = i where the two have chosen each other. */
-kernel void match_pairs(int n, global const int *choice, global int *mate)
+kernel void match_pairs(int size, global const int *choice, global int *mate)
 {
-    const int i = get_global_id(0);
-    if (i >= n)
-        return;
+    WORK_ITEM(i);
     const int j = choice[i];
     if (j != NONE && choice[j] == i)
         mate[i] = j;
@@ -111,20 +104,17 @@ inline int root_of(int i, global const int *mate, global const int *choice)
 }
 
 /* is_root[i] = 1 for roots, else 0. */
-kernel void mark_roots(int n, global const int *mate, global const int *choice, global int *is_root)
+kernel void mark_roots(int size, global const int *mate, global const int *choice, global int *is_root)
 {
-    const int i = get_global_id(0);
-    if (i < n)
-        is_root[i] = root_of(i, mate, choice) == i;
+    WORK_ITEM(i);
+    is_root[i] = root_of(i, mate, choice) == i;
 }
 
 /* aggregate[i] = number of the aggregate of cell i, in the order of the roots; roots[g] = root of aggregate g. */
-kernel void number_aggregates(int n, global const int *mate, global const int *choice, global const int *numbers,
+kernel void number_aggregates(int size, global const int *mate, global const int *choice, global const int *numbers,
                               global int *aggregate, global int *roots)
 {
-    const int i = get_global_id(0);
-    if (i >= n)
-        return;
+    WORK_ITEM(i);
     const int r = root_of(i, mate, choice);
     aggregate[i] = numbers[r];
     if (r == i)
@@ -143,13 +133,11 @@ inline int is_first_entry(int i, int k, global const int *starts, global const i
 /* Members of aggregate g: the two mates, then the cells that have chosen the first mate, then those that have chosen
    the second. With `fill` they are written from members[member_starts[g]] on; without it member_starts[g] becomes
    their number. `choice` of cells of other parts is NONE. */
-kernel void list_members(int n_aggregates, int fill, global const int *starts, global const int *columns,
+kernel void list_members(int size, int fill, global const int *starts, global const int *columns,
                          global const int *mate, global const int *choice, global const int *roots,
                          global int *member_starts, global int *members)
 {
-    const int g = get_global_id(0);
-    if (g >= n_aggregates)
-        return;
+    WORK_ITEM(g);
     const int pair[2] = {roots[g], mate[roots[g]]};
     int at = fill ? member_starts[g] : 0;
     for (int s = 0; s < 2; ++s) {
@@ -193,13 +181,11 @@ inline int is_counted(int h, int first, int until, int last, global const int *s
    more of them, earlier entries are searched again. */
 #define REMEMBERED 32
 
-kernel void count_coarse_entries(int n_aggregates, global const int *starts, global const int *columns,
+kernel void count_coarse_entries(int size, global const int *starts, global const int *columns,
                                  global const REAL *weights, global const int *aggregate,
                                  global const int *member_starts, global const int *members, global int *counts)
 {
-    const int g = get_global_id(0);
-    if (g >= n_aggregates)
-        return;
+    WORK_ITEM(g);
     int known[REMEMBERED], count = 0;
     for (int s = member_starts[g]; s < member_starts[g + 1]; ++s) {
         const int i = members[s];
@@ -224,14 +210,12 @@ kernel void count_coarse_entries(int n_aggregates, global const int *starts, glo
 }
 
 /* Coarse weights w_gh = factor sum_{i in g, j in h} w_ij: the row of aggregate g. */
-kernel void sum_coarse_weights(int n_aggregates, REAL factor, global const int *starts, global const int *columns,
+kernel void sum_coarse_weights(int size, REAL factor, global const int *starts, global const int *columns,
                                global const REAL *weights, global const int *aggregate, global const int *member_starts,
                                global const int *members, global const int *row_starts, global int *row_columns,
                                global REAL *row_weights)
 {
-    const int g = get_global_id(0);
-    if (g >= n_aggregates)
-        return;
+    WORK_ITEM(g);
     const int begin = row_starts[g];
     int end = begin;
     for (int s = member_starts[g]; s < member_starts[g + 1]; ++s) {
@@ -260,12 +244,9 @@ kernel void sum_coarse_weights(int n_aggregates, REAL factor, global const int *
 
 /* w_gh = w_hg for h < g. The two sums differ by round-off; the row of the lower aggregate is kept, so that the graph is
    symmetric to the last bit. Entries with h < g are only written, the others only read. */
-kernel void symmetrize_weights(int n_aggregates, global const int *starts, global const int *columns,
-                               global REAL *weights)
+kernel void symmetrize_weights(int size, global const int *starts, global const int *columns, global REAL *weights)
 {
-    const int g = get_global_id(0);
-    if (g >= n_aggregates)
-        return;
+    WORK_ITEM(g);
     for (int k = starts[g]; k < starts[g + 1]; ++k) {
         const int h = columns[k];
         if (h > g)
@@ -278,13 +259,11 @@ kernel void symmetrize_weights(int n_aggregates, global const int *starts, globa
 }
 
 /* Members of aggregates of aggregates, as cells of the fine graph. `fill` as in `list_members`. */
-kernel void compose_members(int n_aggregates, int fill, global const int *outer_starts, global const int *outer,
+kernel void compose_members(int size, int fill, global const int *outer_starts, global const int *outer,
                             global const int *inner_starts, global const int *inner, global int *member_starts,
                             global int *members)
 {
-    const int g = get_global_id(0);
-    if (g >= n_aggregates)
-        return;
+    WORK_ITEM(g);
     int at = fill ? member_starts[g] : 0;
     for (int s = outer_starts[g]; s < outer_starts[g + 1]; ++s)
         for (int k = inner_starts[outer[s]]; k < inner_starts[outer[s] + 1]; ++k) {
@@ -297,11 +276,10 @@ kernel void compose_members(int n_aggregates, int fill, global const int *outer_
 }
 
 /* aggregate[i] = outer[inner[i]]: the aggregate after two passes. */
-kernel void compose_aggregates(int n, global const int *inner, global const int *outer, global int *aggregate)
+kernel void compose_aggregates(int size, global const int *inner, global const int *outer, global int *aggregate)
 {
-    const int i = get_global_id(0);
-    if (i < n)
-        aggregate[i] = outer[inner[i]];
+    WORK_ITEM(i);
+    aggregate[i] = outer[inner[i]];
 }
 
 /* Pairwise Jacobi smoother u = B^-1 r. B is the diagonal of A, with 2 x 2 blocks for matched pairs:
@@ -316,12 +294,11 @@ kernel void compose_aggregates(int n, global const int *inner, global const int 
    inverse indefinite. both is the same to the last bit for the two cells of a pair.
 
    mate may be the array `partner` of an earlier call: a cell that is its own mate has none. */
-kernel void invert_pair_blocks(int n, global const int *starts, global const int *columns, global const REAL *weights,
-                               global const int *mate, global int *partner, global REAL *own, global REAL *both)
+kernel void invert_pair_blocks(int size, global const int *starts, global const int *columns,
+                               global const REAL *weights, global const int *mate, global int *partner,
+                               global REAL *own, global REAL *both)
 {
-    const int i = get_global_id(0);
-    if (i >= n)
-        return;
+    WORK_ITEM(i);
     const int j = mate[i] == i ? NONE : mate[i];
     REAL mine = 0, theirs = 0, between = 0;
     for (int k = starts[i]; k < starts[i + 1]; ++k) {

@@ -18,46 +18,41 @@ inline REAL apply_pair_inverse(int i, global const int *partner, global const RE
 }
 
 /* b = r, rounded. */
-kernel void take_residual(int n, global const SOURCE *r, global REAL *b)
+kernel void take_residual(int size, global const SOURCE *r, global REAL *b)
 {
-    const int i = get_global_id(0);
-    if (i < n)
-        b[i] = r[i];
+    WORK_ITEM(i);
+    b[i] = r[i];
 }
 
 /* u = x. */
-kernel void give_correction(int n, global const REAL *x, global SOURCE *u)
+kernel void give_correction(int size, global const REAL *x, global SOURCE *u)
 {
-    const int i = get_global_id(0);
-    if (i < n)
-        u[i] = x[i];
+    WORK_ITEM(i);
+    u[i] = x[i];
 }
 
 /* x = omega B^-1 b: the first step from x = 0. */
-kernel void smooth_from_zero(int n, REAL omega, global const int *partner, global const REAL *own,
+kernel void smooth_from_zero(int size, REAL omega, global const int *partner, global const REAL *own,
                              global const REAL *both, global const REAL *b, global REAL *x)
 {
-    const int i = get_global_id(0);
-    if (i < n)
-        x[i] = omega * apply_pair_inverse(i, partner, own, both, b);
+    WORK_ITEM(i);
+    x[i] = omega * apply_pair_inverse(i, partner, own, both, b);
 }
 
 /* t = b - A x. */
-kernel void compute_defect(int n, global const int *starts, global const int *columns, global const REAL *weights,
+kernel void compute_defect(int size, global const int *starts, global const int *columns, global const REAL *weights,
                            global const REAL *b, global const REAL *x, global REAL *t)
 {
-    const int i = get_global_id(0);
-    if (i < n)
-        t[i] = b[i] - row_difference(i, n, starts, columns, weights, x);
+    WORK_ITEM(i);
+    t[i] = b[i] - row_difference(i, size, starts, columns, weights, x);
 }
 
 /* x += omega B^-1 t. */
-kernel void smooth(int n, REAL omega, global const int *partner, global const REAL *own, global const REAL *both,
+kernel void smooth(int size, REAL omega, global const int *partner, global const REAL *own, global const REAL *both,
                    global const REAL *t, global REAL *x)
 {
-    const int i = get_global_id(0);
-    if (i < n)
-        x[i] += omega * apply_pair_inverse(i, partner, own, both, t);
+    WORK_ITEM(i);
+    x[i] += omega * apply_pair_inverse(i, partner, own, both, t);
 }
 
 /* Sum of t over the members of aggregate g. */
@@ -70,20 +65,18 @@ inline REAL sum_members(int g, global const int *member_starts, global const int
 }
 
 /* Restriction: b of an aggregate = sum of the defects of its members. */
-kernel void restrict_defect(int n_aggregates, global const REAL *t, global const int *member_starts,
-                            global const int *members, global REAL *coarse_b)
+kernel void restrict_defect(int size, global const REAL *t, global const int *member_starts, global const int *members,
+                            global REAL *coarse_b)
 {
-    const int g = get_global_id(0);
-    if (g < n_aggregates)
-        coarse_b[g] = sum_members(g, member_starts, members, t);
+    WORK_ITEM(g);
+    coarse_b[g] = sum_members(g, member_starts, members, t);
 }
 
 /* Prolongation: x_i += correction of the aggregate of i. */
-kernel void prolong(int n, global const int *aggregate, global const REAL *e, global REAL *x)
+kernel void prolong(int size, global const int *aggregate, global const REAL *e, global REAL *x)
 {
-    const int i = get_global_id(0);
-    if (i < n)
-        x[i] += e[aggregate[i]];
+    WORK_ITEM(i);
+    x[i] += e[aggregate[i]];
 }
 
 /* Several steps at once, for GPUs, on which a launch costs more than the steps of most levels. They evaluate values of
@@ -146,13 +139,11 @@ kernel void prolong_and_smooth_pairs(int n, REAL omega, global const int *starts
 }
 
 /* Restriction: b of an aggregate = sum of the defects b - A x of its members. */
-kernel void restrict_new_defect(int n_aggregates, int n, global const int *starts, global const int *columns,
+kernel void restrict_new_defect(int size, int n, global const int *starts, global const int *columns,
                                 global const REAL *weights, global const REAL *b, global const REAL *x,
                                 global const int *member_starts, global const int *members, global REAL *coarse_b)
 {
-    const int g = get_global_id(0);
-    if (g >= n_aggregates)
-        return;
+    WORK_ITEM(g);
     REAL sum = 0;
     for (int s = member_starts[g]; s < member_starts[g + 1]; ++s) {
         const int i = members[s];

@@ -55,20 +55,18 @@ inline REAL sum_measures(int k, int end, global const int *neighbors, global con
    mean of the two cells' measures of the face, which differ by round-off. The weight stays 0 for walls, for a face that
    only one cell has (shorter than round-off), and for all but the first of several faces of two cells. A ghost, j >= n,
    has no row: its l_ij is the measure that cell i has. */
-kernel void assemble_laplacian(int n, int weighted, global const int *starts, global const int *neighbors,
+kernel void assemble_laplacian(int size, int weighted, global const int *starts, global const int *neighbors,
                                global const FACE *face_measures, global const REAL *points, global const REAL *density,
                                global STORE *weights PERIOD_ARGS)
 {
-    const int i = get_global_id(0);
-    if (i >= n)
-        return;
+    WORK_ITEM(i);
     const REAL root_i = weighted ? sqrt(density[i]) : R(1);
-    const int last = starts[n] - 8, end = starts[i + 1];
+    const int last = starts[size] - 8, end = starts[i + 1];
     for (int k = starts[i]; k < end; ++k) {
         const int j = neighbors[k];
         if (j <= i)
             continue;
-        const int there = j < n ? find_entry(i, j, last, starts, neighbors) : k;
+        const int there = j < size ? find_entry(i, j, last, starts, neighbors) : k;
         if (there < 0)
             continue;
         if (SEVERAL && find_entry(j, i, last, starts, neighbors) < k)
@@ -79,7 +77,7 @@ kernel void assemble_laplacian(int n, int weighted, global const int *starts, gl
             square += d * d;
         }
         const REAL here = sum_measures(k, end, neighbors, face_measures);
-        const REAL other = j < n ? sum_measures(there, starts[j + 1], neighbors, face_measures) : here;
+        const REAL other = j < size ? sum_measures(there, starts[j + 1], neighbors, face_measures) : here;
         REAL weight = R(0.5) * (here + other) / sqrt(square);
         if (weighted)
             weight *= root_i * sqrt(density[j]);
@@ -89,11 +87,9 @@ kernel void assemble_laplacian(int n, int weighted, global const int *starts, gl
 }
 
 /* inverse_i = 1 / sum_j w_ij, or 0 if the sum is 0: Jacobi's preconditioner. */
-kernel void invert_diagonal(int n, global const int *starts, global const STORE *weights, global STORE *inverse)
+kernel void invert_diagonal(int size, global const int *starts, global const STORE *weights, global STORE *inverse)
 {
-    const int i = get_global_id(0);
-    if (i >= n)
-        return;
+    WORK_ITEM(i);
     REAL sum = 0;
     for (int k = starts[i]; k < starts[i + 1]; ++k)
         sum += weights[k];

@@ -44,8 +44,7 @@ kernel void clip_polygons(const int size, const int rows, global const REAL *bin
     if (i >= rows || (some && slot_counts[i]))
         return;
     SITE(x, p, binned);
-    const REAL lower[2] = {box_lower.s0, box_lower.s1};
-    const REAL upper[2] = {box_upper.s0, box_upper.s1};
+    BOX_CORNERS(lower, upper);
 #ifdef SPHERE
     const search_t in = {points, binned, items, bins, grid_frames, grid_shapes};
 #endif
@@ -89,8 +88,7 @@ kernel void clip_by_rings(const int size, global const REAL *points, const REAL4
 {
     LONG_ITEM(i);
     SITE(x, i, points);
-    const REAL lower[2] = {box_lower.s0, box_lower.s1};
-    const REAL upper[2] = {box_upper.s0, box_upper.s1};
+    BOX_CORNERS(lower, upper);
     cell_t cell;
     start_polygon(&cell, i, x, lower, upper);
     int flag = 0;
@@ -199,8 +197,7 @@ kernel void match_polygon_faces(const int size, global const int *places, global
             atomic_or(report, FLAG_COLLAPSED);
         } else {
             SITE(x, i, points);
-            const REAL lower[2] = {box_lower.s0, box_lower.s1};
-            const REAL upper[2] = {box_upper.s0, box_upper.s1};
+            BOX_CORNERS(lower, upper);
             const int a = row[k == 0 ? n - 1 : k - 1];
             const int b = row[k == n - 1 ? 0 : k + 1];
             const REAL2 tip = corner(i, x, a, b, points, lower, upper);
@@ -250,8 +247,7 @@ kernel void measure_cells(const int size, global const int *places, global const
 {
     if (ahead && !are_right(report, room))
         return;
-    const REAL lower[2] = {box_lower.s0, box_lower.s1};
-    const REAL upper[2] = {box_upper.s0, box_upper.s1};
+    BOX_CORNERS(lower, upper);
     const face_rows_t rows = face_rows(places, slots, slot_counts, old_starts, old_neighbors);
     const measures_t to = {starts, neighbors, face_measures, face_centroids, volumes, offsets, covariances};
 #if IN_LANES
@@ -273,8 +269,7 @@ kernel void measure_faces(const int size, global const int *starts, global const
 {
     LONG_ITEM(i);
     SITE(x, i, points);
-    const REAL lower[2] = {box_lower.s0, box_lower.s1};
-    const REAL upper[2] = {box_upper.s0, box_upper.s1};
+    BOX_CORNERS(lower, upper);
     const int begin = starts[i], end = starts[i + 1];
     if (begin == end)
         return;
@@ -337,8 +332,7 @@ kernel void check_doubtful(const int size, global const int *places, global cons
     if (places[i] < 0)
         return;
     SITE(x, i, points);
-    const REAL lower[2] = {box_lower.s0, box_lower.s1};
-    const REAL upper[2] = {box_upper.s0, box_upper.s1};
+    BOX_CORNERS(lower, upper);
     global const int *row = neighbors + starts[i];
     const int n = starts[i + 1] - starts[i];
     if (n == 0)

@@ -148,8 +148,7 @@ kernel void check_rows(const int size, const int stride, const int rest, const i
                        global const int *neighbors, global const REAL *points, const REAL4 box_lower,
                        const REAL4 box_upper, global int *fits, global int *marks, global int *report)
 {
-    const REAL lower[2] = {box_lower.s0, box_lower.s1};
-    const REAL upper[2] = {box_upper.s0, box_upper.s1};
+    BOX_CORNERS(lower, upper);
     if (rest && report[REPORT_WRONG] > most_wrong)
         return;
     const int id = get_global_id(0);
@@ -259,8 +258,7 @@ kernel void clip_marked(const int size, global const int *listed, const int roun
     if (count >= wrapped_from && slot_counts[base + w] > 0)
         return;
     SITE(x, i, points);
-    const REAL lower[2] = {box_lower.s0, box_lower.s1};
-    const REAL upper[2] = {box_upper.s0, box_upper.s1};
+    BOX_CORNERS(lower, upper);
     const face_rows_t rows = face_rows(places, slots, slot_counts, old_starts, old_neighbors);
     cell_t cell;
     start_polygon(&cell, i, x, lower, upper);
@@ -324,8 +322,7 @@ kernel void check_clipped(const int size, global const int *listed, const int ro
         return;
     const int i = listed[w];
     SITE(x, i, points);
-    const REAL lower[2] = {box_lower.s0, box_lower.s1};
-    const REAL upper[2] = {box_upper.s0, box_upper.s1};
+    BOX_CORNERS(lower, upper);
     const face_rows_t rows = face_rows(places, slots, slot_counts, old_starts, old_neighbors);
     int n, m;
     global const int *row = face_row(&rows, i, &n);

@@ -26,8 +26,7 @@ kernel void order_rows(const int size, global const int *starts, global int *nei
                        global REAL *offsets, global REAL *covariances, global float *reach)
 {
     LONG_ITEM(i);
-    const REAL lower[2] = {box_lower.s0, box_lower.s1};
-    const REAL upper[2] = {box_upper.s0, box_upper.s1};
+    BOX_CORNERS(lower, upper);
     const measures_t to = {starts, neighbors, face_measures, face_centroids, volumes, offsets, covariances};
     const int begin = starts[i], n = starts[i + 1] - begin;
     int faces[ROW_CAPACITY], first = 0;

@@ -33,8 +33,7 @@ kernel void place_polygon_vertices(const int size, global const REAL *points, co
 {
     WORK_ITEM(i);
     SITE(x, i, points);
-    const REAL lower[2] = {box_lower.s0, box_lower.s1};
-    const REAL upper[2] = {box_upper.s0, box_upper.s1};
+    BOX_CORNERS(lower, upper);
     const int begin = starts[i], end = starts[i + 1];
     for (int c = begin; c < end; ++c) {
         const int v = ids[owners[c]];
