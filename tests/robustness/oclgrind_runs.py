@@ -11,7 +11,7 @@ from unittest import mock
 import numpy as np
 
 import clvoro
-from clvoro.adaptation import local_counts, preparation
+from clvoro.adaptation import preparation, tuning
 from clvoro.adaptation.insertion_deletion import InsertionDeletion
 from clvoro.adaptation.methods import ProjectedMethod, PublishedMethod, Relaxation, WeightedMethod
 from clvoro.adaptation.plan.actions import (
@@ -104,7 +104,7 @@ def every_step(domain: Domain, size: str, n_cells: int, levels: int = 1, **optio
             with (
                 mock.patch.object(preparation, "adaptive_schedule", return_value=plan),
                 mock.patch.object(InsertionDeletion, "repair_cells", repair_cells),
-                mock.patch.object(local_counts, "LEAST_GAIN", LEAST_GAIN),
+                mock.patch.object(tuning, "LEAST_GAIN", LEAST_GAIN),
             ):
                 result = adapter.run(
                     domain,
