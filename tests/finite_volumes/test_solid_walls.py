@@ -364,6 +364,19 @@ def test_a_cut_makes_two_convex_cells_of_one(ctx):
     assert min(found) == 0
 
 
+def test_a_surface_recalls_its_answers():
+    """Only points that are new since the last meshes are searched for."""
+    solid, asked = SOLIDS["cube"](), list[int]()
+    surface = WallSurface(solid, lambda x, _: (asked.append(len(x)), solid.feet(x).triangle)[1])
+    x = np.random.default_rng(1).random((200, 3))
+    for new in (200, 0, 50):
+        x[:new] += 0.01
+        for found, expected in zip(surface.closest(x), solid.closest(x), strict=True):
+            np.testing.assert_array_equal(found, expected)
+        surface.recall()
+    assert asked == [200, 50]
+
+
 def test_cures_are_repeated_where_cells_are_the_same(ctx):
     """The other mesh has its vertices and loops in another order; then one of its cells differs."""
     cures, cells = l_cell(ctx)
@@ -376,8 +389,10 @@ def test_cures_are_repeated_where_cells_are_the_same(ctx):
     other = replace(mesh, points=points, corners=corners.astype(np.int32))
     again = Cures(cures.surface, other, cures.names, cures.sizes, cures)
     assert len(again.edits.taken) == len(cures.edits.taken) > 0
-    expected, found = cures.edits.result()[0], again.edits.result()[0]
+    (expected, numbers), found = cures.edits.result(), again.edits.result()[0]
     assert found.n_cells == expected.n_cells > mesh.n_cells
+    middles, of = cures.edits.middles([(cures.edits, c) for c in numbers.tolist()]), expected.measures.geometry
+    np.testing.assert_allclose(middles, np.column_stack([of.centroids, of.volumes]), rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(found.measures.volumes, expected.measures.volumes, rtol=1e-9)
     first = cures.edits.taken[0]
     v = order[next(v for k in first.faces_of(cells[0]) for v in first.face(k)[2] if v < len(order))]

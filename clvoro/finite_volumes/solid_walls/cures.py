@@ -95,6 +95,7 @@ class Cures:
         self.most, self.strictly = _MOST, strictly
         self.excess: dict[int, tuple[int, float]] = {}
         self.judged: dict[tuple[Edits, int, bool], list[Option]] = {}
+        self.concave: dict[tuple[Edits, int], list[tuple[float, Edge, int, int, np.ndarray]]] = {}
         if earlier is not None:
             self._take_over(earlier)
 
@@ -128,7 +129,7 @@ class Cures:
         self.measure([cell])
         if self.excess[cell][1] == 0:
             return False
-        self.judged = {}
+        self.judged, self.concave = {}, {}
         for last in (False,) if self.strictly else (False, True):
             self.searches += 1
             if (found := self._best(edits, cell, _AHEAD, last)) is not None:
@@ -240,8 +241,13 @@ class Cures:
         """Return the edges where a cell is concave, the one with the largest angle first.
 
         Each is a tuple: the angle beyond 180 degrees, the ends, the faces left and right of the edge, as seen from
-        outside, and the outward normal of the left one.
+        outside, and the outward normal of the left one. Each search finds them once.
         """
+        if (edits, cell) not in self.concave:
+            self.concave[edits, cell] = self._found_concave(edits, cell)
+        return self.concave[edits, cell]
+
+    def _found_concave(self, edits: Edits, cell: int) -> list[tuple[float, Edge, int, int, np.ndarray]]:
         sides: dict[tuple[int, int], tuple[int, np.ndarray]] = {}
         for k in edits.faces_of(cell):
             loop = edits.seen(k, cell)
