@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import pairwise
 from os import PathLike
 from pathlib import Path
@@ -115,6 +115,24 @@ def read_geojson(source: Any) -> tuple[Any, str]:
         return json.loads(text), name
     except (ValueError, RecursionError) as error:
         raise InputError(f"{name} is not JSON ({error}), expected GeoJSON") from error
+
+
+def geometries_of_geojson(source: Any) -> Iterator[Any]:
+    """Yield the geometries of all features in a GeoJSON file, text or object, as those of shapely."""
+    found, name = read_geojson(source)
+    nodes = [found]
+    while nodes:
+        node = nodes.pop()
+        kind = node.get("type") if isinstance(node, Mapping) else None
+        if kind == "FeatureCollection":
+            nodes += reversed(list(node.get("features") or ()))
+        elif kind == "Feature":
+            nodes.append(node.get("geometry"))
+        elif node is not None:  # features may have no geometry
+            try:
+                yield shapely.geometry.shape(dict(node))
+            except Exception as error:
+                raise InputError(f"{name} has {node!r:.60} ({error!s:.100}), expected GeoJSON") from error
 
 
 def pieces_of_description(values: Mapping[str, Any]) -> list[list[np.ndarray]]:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from functools import cached_property
 from numbers import Real
+from os import PathLike
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from ..errors import InputError, InputTypeError
 from ..geometry import curves
 from ..geometry.bvh import Tree
 from ..geometry.domain import LARGEST_EDGE, Domain
+from ..geometry.geojson import geometries_of_geojson
 from ..geometry.lines.lines import Lines
 from ..geometry.shapes import Circle, Edges, Polyline, Segment, shapes_of
 from ..geometry.surface import Surface
@@ -33,6 +35,19 @@ _STRAIGHT, _ROUND, _TRIANGLE = 0, 1, 2
 
 Curve = Circle | Segment | Polyline | Edges | curves.Curve | Lines
 Shape = Curve | Surface | Domain
+GeoJSON = str | PathLike | Mapping
+
+
+def _shapes_in(given: Any) -> list[Any]:
+    """Return the shapes that a geometry of shapely or GeoJSON stands for, or else what is given."""
+    if isinstance(given, shapely.Geometry):
+        return list(shapes_of(given))
+    if isinstance(given, GeoJSON):
+        found = [shape for geometry in geometries_of_geojson(given) for shape in shapes_of(geometry)]
+        if not found:
+            raise InputError(f"{given!s:.60} has no geometries, expected points, lines or polygons")
+        return found
+    return [given]
 
 
 class Distance(Field):
@@ -44,7 +59,8 @@ class Distance(Field):
         `Circle`, `Segment`, `Polyline`, `ClosedPolyline`; in 3D `Ball`, `Segment`, `Polyline`, `ClosedPolyline`,
         `Surface`; a `clvoro.Box`, `clvoro.Polygon` or `clvoro.Solid`, which stands for its walls
         (``domain.boundary("island")`` for some of them); in 2D a curve of `clvoro.curves`, or a geometry of shapely,
-        which stands for its points, lines and rings. The distance is to the curve or surface, from both sides.
+        which stands for its points, lines and rings, or GeoJSON with such geometries: a path, a text or a dict. The
+        distance is to the curve or surface, from both sides.
     h_min : float
         Size on the shapes.
     growth : float, optional
@@ -72,7 +88,7 @@ class Distance(Field):
 
     def __init__(
         self,
-        shapes: Shape | shapely.Geometry | Iterable[Shape | shapely.Geometry],
+        shapes: Shape | shapely.Geometry | GeoJSON | Iterable[Shape | shapely.Geometry | GeoJSON],
         h_min: float,
         growth: float | None = None,
         h_max: float = math.inf,
@@ -84,9 +100,8 @@ class Distance(Field):
                 f"{name} got shapes {shapes!r} of type {type(shapes).__name__}, expected a shape or a list of them, "
                 f"such as {name}(Circle((0.5, 0.5), 0.1), 0.01, growth=1.2)"
             )
-        given: Any = [shapes] if isinstance(shapes, (Shape, shapely.Geometry)) else shapes
-        parts = [shapes_of(s) if isinstance(s, shapely.Geometry) else [s] for s in given]
-        self.shapes: tuple[Any, ...] = tuple(shape for some in parts for shape in some)
+        given: Any = [shapes] if isinstance(shapes, (Shape, shapely.Geometry, GeoJSON)) else shapes
+        self.shapes: tuple[Any, ...] = tuple(shape for some in given for shape in _shapes_in(some))
         for shape in self.shapes:
             if not isinstance(shape, Shape):
                 bare = isinstance(shape, list | tuple | np.ndarray | Real)

@@ -13,9 +13,10 @@ from ..errors import InputError, InputTypeError
 from ..geometry import curves
 from ..geometry.bvh import Tree
 from ..geometry.domain import Domain
+from ..geometry.geojson import geometries_of_geojson
 from ..geometry.shapes import Circle, ClosedPolyline
 from ..geometry.surface import Surface
-from .distance import Distance
+from .distance import Distance, GeoJSON
 
 if TYPE_CHECKING:
     from .codegen import CodeWriter
@@ -34,9 +35,9 @@ class Region(Distance):
     Parameters
     ----------
     shapes : shape or iterable of shapes
-        In 2D a `clvoro.Polygon` or `clvoro.Box`, a `Circle`, a `ClosedPolyline`, a closed curve of `clvoro.curves`, or
-        a polygon of shapely; in 3D a `clvoro.Box`, a `clvoro.Solid`, a `Ball`, or a closed `Surface`. On a sphere
-        those of 2D in longitudes and latitudes in degrees. Several shapes are one region.
+        In 2D a `clvoro.Polygon` or `clvoro.Box`, a `Circle`, a `ClosedPolyline`, a closed curve of `clvoro.curves`, a
+        polygon of shapely, or polygons in GeoJSON; in 3D a `clvoro.Box`, a `clvoro.Solid`, a `Ball`, or a closed
+        `Surface`. On a sphere those of 2D in longitudes and latitudes in degrees. Several shapes are one region.
     h : float
         Size in the region.
     growth, slope, h_max : float
@@ -57,8 +58,11 @@ class Region(Distance):
     def __init__(
         self, shapes: Any, h: float, growth: float | None = None, h_max: float = math.inf, slope: float | None = None
     ):
-        super().__init__(shapes, h, growth, h_max, slope)
-        given = list(shapes) if isinstance(shapes, Iterable) and not isinstance(shapes, Surface | Domain) else [shapes]
+        one = isinstance(shapes, GeoJSON | Surface | Domain) or not isinstance(shapes, Iterable)
+        given: list[Any] = []
+        for shape in [shapes] if one else shapes:
+            given += geometries_of_geojson(shape) if isinstance(shape, GeoJSON) else [shape]
+        super().__init__(given, h, growth, h_max, slope)
         self.shapes = tuple(given)
         dim = int(self.dim or 0)
         made: list[Any] = [{2: _area_of, 3: _solid_of}[dim](shape) for shape in given]

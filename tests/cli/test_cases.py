@@ -1,5 +1,6 @@
 """Case files: what they may hold, how they are refused, and that writing and reading agree."""
 
+import json
 import math
 
 import numpy as np
@@ -302,11 +303,23 @@ def test_toml_is_written_with_lists_of_numbers_on_one_line():
 def test_fixed_generators_are_positions_or_a_file(tmp_path):
     at = [[0.5, 0.25], [1.5, 0.75]]
     np.save(tmp_path / "wells.npy", at)
-    size = "[size]\nkind = 'constant'\nvalue = 0.3\n[run]\n"
-    inline, named = (case(f"{size}fixed = {value}", tmp_path) for value in (at, "'wells.npy'"))
+    (tmp_path / "wells.csv").write_text("name, X, Y, rate\na, 0.5, 0.25, 3\nb, 1.5, 0.75, 4\n")
+    points = [{"type": "Feature", "geometry": {"type": "Point", "coordinates": x}} for x in at]
+    (tmp_path / "wells.geojson").write_text(json.dumps({"type": "FeatureCollection", "features": points}))
+    size = "[size]\nkind = 'distance'\nshapes = ['wells.geojson', 'river.geojson']\nh_min = 0.1\nslope = 0.2\n[run]\n"
+    river = {"type": "LineString", "coordinates": [[0, 0.5], [2, 0.5]]}
+    (tmp_path / "river.geojson").write_text(json.dumps(river))
+    values = at, "'wells.npy'", "'wells.csv'", "'wells.geojson'"
+    cases = [case(f"{size}fixed = {value}", tmp_path) for value in values]
     out = tmp_path / "out"
     out.mkdir()
-    for read in (inline, named, load_case(named.write(out))):
+    for read in (*cases, load_case(cases[2].write(out))):
         assert np.array_equal(read.run_arguments()["fixed"], at)
+        assert read.size_field()([(0.5, 0.25), (1, 0.5), (1, 0.9)]) == pytest.approx([0.1, 0.1, 0.18])
+    with pytest.raises(InputError, match=r"run\.fixed names .*river\.geojson' with a LineString, expected points"):
+        case(f"{size}fixed = 'river.geojson'", tmp_path).run_arguments()
+    (tmp_path / "wells.csv").write_text("x, y\n1, deep\n")
+    with pytest.raises(InputError, match=r"run\.fixed names .*expected columns x and y with numbers"):
+        cases[2].run_arguments()
     with pytest.raises(InputError, match=r"run\.fixed.*a text in quotes or a list"):
         case(f"{size}fixed = 0.5")

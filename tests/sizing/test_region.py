@@ -17,6 +17,7 @@ CASES = {
     "box": (clvoro.Box((1, 0.3), (3, 0.7)), PLANE, shapely.box(1, 0.3, 3, 0.7)),
     "ring": (RING, PLANE, RING.geometry),
     "several": ([RING, shapely.box(2.5, 0, 3.5, 0.6)], PLANE, RING.geometry | shapely.box(2.5, 0, 3.5, 0.6)),
+    "geojson": (shapely.to_geojson(RING.geometry), PLANE, RING.geometry),
     "curve": (curves.ellipse((2, 0.5), (1, 0.3)), PLANE, shapely.Polygon(curves.ellipse((2, 0.5), (1, 0.3)).vertices)),
 }
 

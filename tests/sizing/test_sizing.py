@@ -309,7 +309,7 @@ def test_distance_to_simple_shapes():
     assert growing([(3, 0.5)]).tolist() == pytest.approx([4])
 
 
-def test_distance_to_geometries_of_shapely():
+def test_distance_to_geometries_of_shapely_and_geojson():
     """All points, lines and rings count, in collections and multipolygons, too: shapely measures the same."""
     court = shapely.box(0, 0, 4, 4).difference(shapely.box(1, 1, 2, 3))
     lines = shapely.MultiLineString([[(6, 0), (7, 2), (9, 2)], [(8, 8), (9, 9)]])
@@ -318,10 +318,12 @@ def test_distance_to_geometries_of_shapely():
     points = np.random.default_rng(2).uniform(-5, 10, (200, 2))
     edges = shapely.GeometryCollection([court.boundary, lines, places])
     expected = 1 + 0.5 * shapely.distance(edges, shapely.points(points))
-    for shapes in (geometry, [court, lines, places]):
+    for shapes in (geometry, [court, lines, places], shapely.to_geojson(geometry)):
         assert sizing.Distance(shapes, 1, slope=0.5)(points) == pytest.approx(expected, rel=1e-12)
     with pytest.raises(InputError, match="not empty"):
         sizing.Distance(shapely.Polygon(), 1, slope=0.5)
+    with pytest.raises(InputError, match="no geometries, expected points, lines or polygons"):
+        sizing.Distance({"type": "FeatureCollection", "features": []}, 1, slope=0.5)
     with pytest.raises(InputError, match=r"length 1e\+160, expected at most"):
         sizing.Distance(shapely.Point(0, 1e160), 1, slope=0.5)
 

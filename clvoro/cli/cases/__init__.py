@@ -121,7 +121,7 @@ class Case:
         arguments = {key: value for key, value in self.run.items() if key not in apart}
         for key in ("points", "fixed"):
             if isinstance(arguments.get(key), str):
-                arguments[key] = schema.load_array(self.folder / arguments[key], f"run.{key}")
+                arguments[key] = schema.load_points(self.folder / arguments[key], f"run.{key}")
         if "layers" in self.table:
             arguments["layers"] = [Layers(**layers) for layers in self.table["layers"]]
         return arguments
@@ -173,13 +173,12 @@ def _files(node: Any) -> Iterator[tuple[Any, Any]]:
         if isinstance(item, (dict, list)):
             yield from _files(item)
     if isinstance(node, dict):
-        yield from (
-            (node, key)
-            for key in ("file", "points", "fixed", "land", "lines", "surfaces")
-            if isinstance(node.get(key), str)
-        )
-        several = node.get("file")
-        yield from ((several, k) for k in range(len(several) if isinstance(several, list) else 0))
+        for key in ("file", "points", "fixed", "land", "lines", "shapes", "surfaces"):
+            value = node.get(key)
+            if isinstance(value, str):
+                yield node, key
+            elif isinstance(value, list):
+                yield from ((value, k) for k, item in enumerate(value) if isinstance(item, str))
 
 
 def _check_walls(table: dict[str, Any], domain: Domain, place: str) -> None:

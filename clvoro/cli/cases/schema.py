@@ -7,6 +7,7 @@ the table names; `domain` is what sizes are for, and the default extent of raste
 
 from __future__ import annotations
 
+import csv
 import functools
 import operator
 from collections.abc import Callable, Mapping
@@ -15,6 +16,7 @@ from typing import Annotated, Any, ClassVar, Literal, get_args
 
 import msgspec
 import numpy as np
+import shapely
 from msgspec import Meta
 
 from ... import earth, sizing
@@ -25,7 +27,7 @@ from ...files import LONGEST_GEOMETRY, read_text
 from ...geometry.box import Box
 from ...geometry.curves import Curve
 from ...geometry.domain import Domain
-from ...geometry.geojson import FOREIGN, pieces_of_geojson
+from ...geometry.geojson import FOREIGN, geometries_of_geojson, pieces_of_geojson
 from ...geometry.polygon import Polygon
 from ...geometry.solid.solid import Solid
 from ...geometry.sphere import Sphere
@@ -202,6 +204,12 @@ Shape = (
 )
 
 
+def _built(shapes: Any, folder: Path, domain: Any) -> list[Any]:
+    """Return the shapes of a table, with the paths of those that are files of GeoJSON."""
+    given = [shapes] if isinstance(shapes, str) else shapes
+    return [locate(folder, s) if isinstance(s, str) else s.build(folder, domain) for s in given]
+
+
 class PolygonShape(Kind, tag="polygon"):
     """Polygons in a file of GeoJSON or well-known text, or a ring of points with holes."""
 
@@ -252,26 +260,26 @@ class CapsTable(Kind, tag="caps"):
 
 class DistanceTable(Kind, tag="distance"):
     CHOICE = ("growth", "slope")
-    shapes: Annotated[list[Shape], Meta(min_length=1)]
+    shapes: Text | Annotated[list[Shape | Text], Meta(min_length=1)]
     h_min: Positive
     growth: Positive | None = None
     slope: Positive | None = None
     h_max: Positive | None = None
 
     def build(self, folder: Path, domain: Any = None) -> Any:
-        return sizing.Distance([shape.build(folder, domain) for shape in self.shapes], **self.given("shapes"))
+        return sizing.Distance(_built(self.shapes, folder, domain), **self.given("shapes"))
 
 
 class RegionTable(Kind, tag="region"):
     CHOICE = ("growth", "slope")
-    shapes: Annotated[list[RegionShape], Meta(min_length=1)]
+    shapes: Text | Annotated[list[RegionShape | Text], Meta(min_length=1)]
     h: Positive
     growth: Positive | None = None
     slope: Positive | None = None
     h_max: Positive | None = None
 
     def build(self, folder: Path, domain: Any = None) -> Any:
-        return sizing.Region([shape.build(folder, domain) for shape in self.shapes], **self.given("shapes"))
+        return sizing.Region(_built(self.shapes, folder, domain), **self.given("shapes"))
 
 
 class ExpressionTable(Kind, tag="expression"):
@@ -454,6 +462,31 @@ def _require(fits: bool, size: Kind, remedy: str, domain: Domain) -> None:
     if not fits:
         kind = size.__struct_config__.tag
         raise InputError(f"size.kind is {kind!r}, which is not for {domain}; expected {remedy}")
+
+
+def load_points(path: Path, place: str) -> np.ndarray:
+    """Read points from a file of GeoJSON, of comma-separated values, or of an array; `place` is the key that names it.
+
+    Tables of values have a line with names of columns. Those of points are x, y and z, or lon and lat.
+
+    Raises `InputError` if there is no such file or it holds no points.
+    """
+    if path.suffix.lower() in (".json", ".geojson"):
+        shapes = list(geometries_of_geojson(path))
+        if wrong := {shape.geom_type for shape in shapes} - {"Point", "MultiPoint"}:
+            raise InputError(f"{place} names {str(path)!r} with a {min(wrong)}, expected points alone")
+        return shapely.get_coordinates(shapes)
+    if path.suffix.lower() != ".csv":
+        return load_array(path, place)
+    try:
+        rows = list(csv.DictReader(read_text(path, LONGEST_GEOMETRY).splitlines()))
+        columns = {name.strip().lower(): name for name in (rows[0] if rows else {}) if name}
+        names = [columns[name] for name in ("x", "y", "z", "lon", "lat") if name in columns]
+        return np.array([[row[name] for name in names] for row in rows], float).reshape(len(rows), -1)
+    except (OSError, TypeError, ValueError) as error:
+        raise InputError(
+            f"{place} names {str(path)!r}, which cannot be read ({error}), expected columns x and y with numbers"
+        ) from error
 
 
 def load_array(path: Path, place: str) -> np.ndarray:

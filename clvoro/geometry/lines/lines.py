@@ -13,7 +13,7 @@ from ...arguments import format_point, warn
 from ...errors import InputError, InputTypeError, MismatchWarning
 from ..borders import Borders, Size
 from ..curves import Curve
-from ..geojson import read_geojson
+from ..geojson import geometries_of_geojson
 
 if TYPE_CHECKING:
     from ...mesh.diagram import Diagram
@@ -211,8 +211,8 @@ def paths_of(name: str, source: object) -> Iterator[np.ndarray]:
     elif isinstance(source, shapely.Geometry):
         yield from _of_shape(name, source)
     elif isinstance(source, Mapping | str | PathLike) or hasattr(source, "__geo_interface__"):
-        found, file = read_geojson(source)
-        yield from _of_geojson(name, found, file)
+        for shape in geometries_of_geojson(source):
+            yield from _of_shape(name, shape)
     else:
         yield from _of_sequence(name, source)
 
@@ -249,21 +249,6 @@ def _of_shape(name: str, shape: Any) -> Iterator[np.ndarray]:
             yield shapely.get_coordinates(part)
         else:
             raise InputTypeError(f"{name} has a {part.geom_type}, expected {EXPECTED}")
-
-
-def _of_geojson(name: str, node: Any, file: str) -> Iterator[np.ndarray]:
-    kind = node.get("type") if isinstance(node, Mapping) else None
-    if kind == "FeatureCollection":
-        for feature in node.get("features") or ():
-            yield from _of_geojson(name, feature, file)
-    elif kind == "Feature":
-        yield from _of_geojson(name, node.get("geometry"), file)
-    else:
-        try:
-            shape = shapely.geometry.shape(dict(node))
-        except Exception as error:
-            raise InputError(f"{file} has {node!r:.60} ({error!s:.100}), expected GeoJSON with lines") from error
-        yield from _of_shape(name, shape)
 
 
 def _without_repetitions(path: np.ndarray) -> np.ndarray:
