@@ -59,8 +59,9 @@ class Region(Distance):
         self, shapes: Any, h: float, growth: float | None = None, h_max: float = math.inf, slope: float | None = None
     ):
         one = isinstance(shapes, GeoJSON | Surface | Domain) or not isinstance(shapes, Iterable)
+        several: Any = [shapes] if one else shapes
         given: list[Any] = []
-        for shape in [shapes] if one else shapes:
+        for shape in several:
             given += geometries_of_geojson(shape) if isinstance(shape, GeoJSON) else [shape]
         super().__init__(given, h, growth, h_max, slope)
         self.shapes = tuple(given)
