@@ -119,23 +119,26 @@ def quotient(diagram: clvoro.Diagram) -> float:
     return float((36 * np.pi * diagram.volumes**2 / area**3).mean())
 
 
-def measure(adapter: clvoro.Adapter, solid: clvoro.Solid, size: Any, case: Path, **settings: Any) -> dict[str, Any]:
+def measure(adapter: clvoro.Adapter, make: Callable[[], Made], case: Path) -> dict[str, Any]:
     """Adapt, write and check a mesh; return its figures."""
-    begin = time.perf_counter()
+    begin = time.process_time()
+    solid, size, settings, more = make()
     result = adapter.run(solid, size, **settings)
-    seconds = time.perf_counter() - begin
+    seconds = time.process_time() - begin
     result.to_openfoam(case / "constant" / "polyMesh", check=False)
     verdict = check_case(case)
     (case / "checkMesh.log").write_text(verdict.text)
     d = result.diagram
     return {
         "result": result,
+        "verdict": "accepted" if verdict.ok else "rejected",
         "cells": len(d),
         "seconds": seconds,
         "error": float(np.abs(result.size_error).mean()),
         "quotient": quotient(d),
         "volume": float(d.volumes.sum() / solid.measure),
         **figures_of(verdict),
+        **more(result, case),
     }
 
 
@@ -188,77 +191,36 @@ def growing(solid: clvoro.Solid, walls: Iterable[str], h: float) -> clvoro.sizin
     return clvoro.sizing.Distance([solid.boundary(w) for w in walls], h_min=0.5 * h, growth=1.2, h_max=2 * h)
 
 
-def measure_boolean(adapter: clvoro.Adapter, job: int | tuple[Path, bool], cells: int) -> dict[str, Any]:
-    """Mesh a random solid or that of a file, and return its figures with a verdict."""
-    begin = time.process_time()
-    try:
-        solid, h, size = part_of(job, cells)
-        with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always")
-            row = measure(adapter, solid, size, Path(folder))
-            row["seconds"] = time.process_time() - begin
-    except ClvoroError as error:
-        return {"verdict": "refused", "complaints": str(error)}
-    except Exception:
-        return {"verdict": "failed", "complaints": traceback.format_exc(limit=-1)[-200:]}
-    d = row.pop("result").diagram
-    f = d.faces
-    openness = np.zeros((len(d), 3))
-    inner = f.neighbor >= 0
-    np.add.at(openness, f.owner, f.normal * f.area[:, None])
-    np.subtract.at(openness, f.neighbor[inner], (f.normal * f.area[:, None])[inner])
-    off = abs(row["volume"] - 1) * solid.measure / solid.boundary_measure
-    row["verdict"] = "accepted" if row["ok"] else "rejected"
-    if np.abs(openness).max() > 1e-9 * h * h or off > _OFF * h:
-        row["verdict"] = "failed"
-        row["complaints"] += f" walls are off by {off / h:.2f} h, cells are open by {np.abs(openness).max():.1e}"
-    if not row["ok"]:
-        row["complaints"] = "; ".join(
-            [row["complaints"], *(str(w.message) for w in caught if "checkMesh" in str(w.message))]
-        )
-    return row
+def parts(options: argparse.Namespace) -> Iterable[Job]:
+    """Return random solids, or the inside and the outside of the surface in each file."""
 
+    def made(job: int | tuple[Path, bool]) -> Made:
+        solid, h, size = part_of(job, options.cells)
+        return solid, size, {}, partial(defects, h=h)
 
-def _serve(jobs: Any, options: argparse.Namespace) -> None:
-    """Measure the solids that come through a pipe, in a process of its own."""
-    adapter = make_adapter(options)
-    while True:
-        job, used = jobs.recv(), resource.getrusage(resource.RUSAGE_SELF)
-        resource.setrlimit(resource.RLIMIT_CPU, (math.ceil(used.ru_utime + used.ru_stime + options.limit), -1))
-        jobs.send(measure_boolean(adapter, job, options.cells))
-
-
-def measure_booleans(options: argparse.Namespace, report: Report) -> str:
-    """Add a row for each random solid or file, and return how many have each verdict."""
-    context, worker, pipe = multiprocessing.get_context("spawn"), None, None
-    jobs: dict[Any, Any] = {
-        number: number for number in counts(options.only) or range(options.first, options.first + options.booleans)
-    }
+    for number in counts(options.only) or range(options.first, options.first + options.booleans):
+        yield {"solid": number}, partial(made, number)
     if options.files:
         found = sorted(
             p for p in options.files.rglob("*") if p.name.lower().removesuffix(".gz").endswith((".stl", ".obj"))
         )
         once = {p.read_bytes(): p for p in reversed(found)}  # tutorials share files
-        jobs = {f"{p.name}, {what}": (p, what == "outside") for p in once.values() for what in ("inside", "outside")}
-    for number, job in jobs.items():
-        if worker is None or pipe is None:
-            pipe, end = context.Pipe()
-            worker = context.Process(target=_serve, args=(end, options), daemon=True)
-            worker.start()
-            end.close()
-        row: dict[str, Any] = {"solid": number, "cells": 0, **dict.fromkeys(_EMPTY, float("nan"))}
-        pipe.send(job)
-        try:
-            row |= pipe.recv()
-        except EOFError:
-            worker.join()
-            late = worker.exitcode == -signal.SIGXCPU
-            what = f"no end within {options.limit:g} s of processor time" if late else "the process crashed"
-            row |= {"verdict": "failed", "complaints": what}
-            worker = None
-        report.add(row, f"{number}: {row['verdict']} {row['complaints'][:160]}")
-    verdicts = [row["verdict"] for row in report.records]
-    return ", ".join(f"{verdicts.count(v)} {v}" for v in ("accepted", "rejected", "refused", "failed"))
+        for path, outside in product(once.values(), (False, True)):
+            yield {"solid": f"{path.name}, {'outside' if outside else 'inside'}"}, partial(made, (path, outside))
+
+
+def defects(result: clvoro.Result, case: Path, h: float) -> dict[str, Any]:
+    """Return the verdict on a mesh with cells that are open, or walls that are off the surface."""
+    d, f, solid = result.diagram, result.diagram.faces, result.diagram.domain
+    openness = np.zeros((len(d), 3))
+    inner = f.neighbor >= 0
+    np.add.at(openness, f.owner, f.normal * f.area[:, None])
+    np.subtract.at(openness, f.neighbor[inner], (f.normal * f.area[:, None])[inner])
+    off, open_ = abs(d.volumes.sum() - solid.measure) / solid.boundary_measure / h, np.abs(openness).max()
+    if open_ < 1e-9 * h * h and off < _OFF:
+        return {}
+    what = f"walls are off by {off:.2f} h, cells are open by {open_:.1e}"
+    return {"ok": False, "verdict": "failed", "complaints": what}
 
 
 LAYER_COLUMNS = {
@@ -302,6 +264,7 @@ def reached(result: clvoro.Result, case: Path, layers: clvoro.Layers) -> dict[st
     (told,) = result.settings["thickness"]
     return {
         "plain": verdict.ok,
+        "verdict": "accepted" if verdict.ok else "rejected",
         "why": "; ".join(verdict.complaints),
         "prisms": int((d.layer > 0).sum()),
         "inner": float(np.abs(result.size_error[d.layer == 0]).mean()),
@@ -352,28 +315,80 @@ def uniform(options: argparse.Namespace) -> Iterable[Job]:
         yield {"solid": name, "run": run, "h": h, "seed": seed}, partial(made, name, run, h, seed)
 
 
-def measure_all(adapter: clvoro.Adapter, options: argparse.Namespace, report: Report, jobs: Iterable[Job]) -> str:
-    """Add a row for each of `jobs`, and return how many meshes `checkMesh` accepts."""
-    for begin, make in jobs:
-        label = "-".join(map(str, begin.values())).replace(" ", "-")
-        row: dict[str, Any] = {**dict.fromkeys(_EMPTY, float("nan")), "prisms": 0, "regions": 0, **begin}
-        with tempfile.TemporaryDirectory() as folder:
-            case = Path(folder) if options.keep is None else options.keep / label
-            try:
-                domain, size, settings, more = make()
-                row |= measure(adapter, domain, size, case, **settings)
-                row |= more(row["result"], case)
-                if options.pictures is not None:
-                    draw(row["result"], options.pictures / f"{label}.png", label)
-            except Exception as error:  # what must never happen is a row, too
-                known = isinstance(error, ClvoroError)
-                what = f"{type(error).__name__}: {error}" if known else traceback.format_exc(limit=-1)[-100:]
-                row |= {"ok": False, "cells": 0, "complaints": what}
-        row.pop("result", None)
-        what = f"OK {COLUMNS['non-orth. max, mean'](row)}, {row['skewness']:.2f}, {row['seconds']:.0f} s"
-        report.add(row, f"{label}: {what if row['ok'] else row['complaints']}")
-    good = sum(row.get("plain", row["ok"]) for row in report.records)
-    return f"{good} of {len(report.records)} meshes pass checkMesh"
+def measured(adapter: clvoro.Adapter, options: argparse.Namespace, job: Job) -> dict[str, Any]:
+    """Return the row of a job: its figures, or why there are none."""
+    begin, make = job
+    label = "-".join(map(str, begin.values())).replace(" ", "-")
+    row: dict[str, Any] = {**dict.fromkeys(_EMPTY, float("nan")), "prisms": 0, "regions": 0, "cells": 0, **begin}
+    with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        try:
+            row |= measure(adapter, make, Path(folder) if options.keep is None else options.keep / label)
+            if options.pictures is not None:
+                draw(row["result"], options.pictures / f"{label}.png", label)
+        except ClvoroError as error:
+            row |= {"ok": False, "verdict": "refused", "complaints": f"{type(error).__name__}: {error}"}
+        except Exception:  # what must never happen is a row, too
+            row |= {"ok": False, "verdict": "failed", "complaints": traceback.format_exc(limit=-1)[-200:]}
+    row.pop("result", None)
+    if row["verdict"] == "rejected":
+        said = (str(w.message) for w in caught if "checkMesh" in str(w.message))
+        row["complaints"] = "; ".join([row["complaints"], *said])
+    return row
+
+
+def jobs_of(options: argparse.Namespace) -> tuple[dict[str, Callable[[dict[str, Any]], object]], list[Job]]:
+    """Return the columns of a table and its jobs."""
+    columns, jobs = next(
+        (columns, jobs)
+        for chosen, columns, jobs in (
+            (options.booleans or options.files, BOOLEAN_COLUMNS, parts),
+            (options.order, ORDER_COLUMNS, smooth),
+            (options.surfaces, SURFACE_COLUMNS, divided),
+            (options.layers, LAYER_COLUMNS, layered),
+            (options.worst, WORST_COLUMNS, uniform),
+            (True, COLUMNS, uniform),
+        )
+        if chosen
+    )
+    return columns, list(jobs(options))
+
+
+def _serve(jobs: Any, options: argparse.Namespace) -> None:
+    """Measure the jobs whose numbers come through a pipe, in a process of its own."""
+    adapter, (_, known) = make_adapter(options), jobs_of(options)
+    while True:
+        number, used = jobs.recv(), resource.getrusage(resource.RUSAGE_SELF)
+        resource.setrlimit(resource.RLIMIT_CPU, (math.ceil(used.ru_utime + used.ru_stime + options.limit), -1))
+        jobs.send(measured(adapter, options, known[number]))
+
+
+def measure_all(options: argparse.Namespace) -> Report:
+    """Return a report with a row for each job, made in a process that may crash or hang."""
+    context, worker, pipe = multiprocessing.get_context("spawn"), None, None
+    columns, jobs = jobs_of(options)
+    report = Report(options.json, columns)
+    for number, (begin, _) in enumerate(jobs):
+        if worker is None or pipe is None:
+            pipe, end = context.Pipe()
+            worker = context.Process(target=_serve, args=(end, options), daemon=True)
+            worker.start()
+            end.close()
+        pipe.send(number)
+        try:
+            row = pipe.recv()
+        except EOFError:
+            worker.join()
+            late = worker.exitcode == -signal.SIGXCPU
+            what = f"no end within {options.limit:g} s of processor time" if late else "the process crashed"
+            row = {**dict.fromkeys(_EMPTY, float("nan")), "cells": 0, "prisms": 0, "regions": 0, **begin}
+            row |= {"ok": False, "verdict": "failed", "complaints": what}
+            worker = None
+        figures = f"{COLUMNS['non-orth. max, mean'](row)}, {row['skewness']:.2f}, {row['seconds']:.0f} s"
+        report.add(row, f"{', '.join(map(str, begin.values()))}: {row['verdict']} {figures} {row['complaints'][:160]}")
+    if worker is not None:
+        worker.terminate()
+    return report
 
 
 SPEED_COLUMNS = {
@@ -482,9 +497,7 @@ def main() -> None:
     )
     options_of.add_argument("--first", type=int, default=0, metavar="N", help="number of the first random solid")
     options_of.add_argument("--cells", type=int, default=1500, metavar="N", help="of each random solid, about")
-    options_of.add_argument(
-        "--limit", type=float, default=300, metavar="SECONDS", help="processor time for each random solid"
-    )
+    options_of.add_argument("--limit", type=float, default=600, metavar="SECONDS", help="processor time for each mesh")
     options_of.add_argument("--speed", default="", metavar="NUMBERS", help="processor times of so many cells")
     options_of.add_argument("--keep", type=Path, metavar="FOLDER", help="keep the cases, with checkMesh.log")
     options_of.add_argument("--pictures", type=Path, metavar="FOLDER")
@@ -509,22 +522,9 @@ def main() -> None:
         return report.finish(heading(adapter, "processor time of runs, and of meshes that are read with their faces"))
     require("checkMesh")
     adapter = make_adapter(options)
-    if options.booleans or options.files:
-        report = Report(options.json, BOOLEAN_COLUMNS)
-        return report.finish(heading(adapter, measure_booleans(options, report)))
-    columns, jobs = next(
-        (columns, jobs)
-        for chosen, columns, jobs in (
-            (options.order, ORDER_COLUMNS, smooth),
-            (options.surfaces, SURFACE_COLUMNS, divided),
-            (options.layers, LAYER_COLUMNS, layered),
-            (options.worst, WORST_COLUMNS, uniform),
-            (True, COLUMNS, uniform),
-        )
-        if chosen
-    )
-    report = Report(options.json, columns)
-    title = measure_all(adapter, options, report, jobs(options))
+    report = measure_all(options)
+    verdicts = [row["verdict"] for row in report.records]
+    title = ", ".join(f"{verdicts.count(v)} {v}" for v in ("accepted", "rejected", "refused", "failed"))
     if options.worst:
         report.records = worst_of(report.records)
         title += f", {sum(row['good'] for row in report.records)} meet the goals"

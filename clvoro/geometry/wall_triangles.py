@@ -29,6 +29,8 @@ SIDE_PER_ROOT, LEAST_SIDE, LARGEST_SIDE = 0.4, 48, 128
 so that few triangles are in several of them."""
 _SLACK = 1e-3
 """Of a bin, more than round-off in single precision."""
+_FLAT = 1e-14
+"""Height of a triangle over the largest coordinate: the normals of flatter ones are round-off."""
 _BLOCK = 1 << 20
 """Pairs of a triangle and a bin that are tested at once."""
 
@@ -43,7 +45,7 @@ class WallTriangles:
     - `ends` (t, 3) int: the same for corner s: `CONCAVE` where a concave crease of the patch passes or ends.
 
     Its attributes:
-    - `items` (k,) int: the triangles that have an area; only these are kept, by patch, and near ones after each other.
+    - `items` (k,) int: the triangles that are not flat; only these are kept, by patch, and near ones after each other.
     """
 
     def __init__(
@@ -51,7 +53,9 @@ class WallTriangles:
     ) -> None:
         corners = np.asarray(corners, float)
         sides = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        items = np.flatnonzero(np.linalg.norm(sides, axis=1) > 0)
+        longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
+        flat = _FLAT * np.abs(corners).max() * longest
+        items = np.flatnonzero(np.linalg.norm(sides, axis=1) > flat)
         source, corners, normals, edges, ends, *tips = _divided_at_tips(
             *(np.asarray(array)[items] for array in (corners, normals, edges, ends))
         )

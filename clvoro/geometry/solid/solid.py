@@ -120,6 +120,10 @@ class Solid(Domain):
 
     curved_walls = extrudes_layers = True
     leaves_out = "volume"
+    remedy_for_narrow_parts = (
+        "Use smaller sizes there, as sizing.gap_size does, or fill such gaps around a body by wrap=, two thirds of the "
+        "size of cells"
+    )
 
     def __init__(
         self,

@@ -30,6 +30,9 @@ _OFF = 0.5
 """Distance of the closed surface from the triangles, over `reach`."""
 _STEP, _EDGE = 3, 1.5
 """Grid points per reach; length of edges of the wrap in steps of the grid."""
+_SHEAR = np.array([(1, 0, 0), (0.17, 1, 0), (0.11, 0, 1)])
+_UNSHEARED = np.linalg.inv(_SHEAR)
+"""The library sees positions times this matrix: its level sets crash, at times, at large planes x = constant."""
 _SIMPLER = 0.1
 """How far triangles may move to be fewer, in steps of the grid."""
 _SPACING, _APART = 1.0, 0.25
@@ -223,8 +226,9 @@ class _Sampled:
 
     @cached_property
     def _bounds(self) -> list[float]:
-        """Corners of the box in which the library finds surfaces."""
-        return [*(self.low + 0.5 * self.step).tolist(), *(self.low + (self.shape - 1.5) * self.step).tolist()]
+        """Corners of the box in which the library finds surfaces, sheared."""
+        corners = self.low + self.step * np.array([np.full(3, 0.5), self.shape - 1.5])
+        return (corners @ _SHEAR).ravel().tolist()
 
     @cached_property
     def _places(self) -> np.ndarray:
@@ -236,14 +240,15 @@ class _Sampled:
             return -1.0
 
         library().Manifold.level_set(note, self._bounds, _EDGE * self.step)
-        return (np.frombuffer(asked).reshape(-1, 3) - self.low).T / self.step
+        return (np.frombuffer(asked).reshape(-1, 3) @ _UNSHEARED - self.low).T / self.step
 
     def level(self, name: str, values: np.ndarray, simpler: float = 0.0) -> Surface:
-        """Return the surface where `values` on the grid are 0, around those above."""
-        found = iter(scipy.ndimage.map_coordinates(values, self._places, order=1).tolist())
+        """Return the surface where `values` on the grid are 0, around those above, which are not at its border."""
+        found = iter(scipy.ndimage.map_coordinates(values, self._places, order=1, mode="nearest").tolist())
         made = library().Manifold.level_set(lambda *_: next(found), self._bounds, _EDGE * self.step)
         mesh = (made.simplify(simpler * self.step) if simpler else made).to_mesh64()
-        return Surface(np.array(mesh.vert_properties)[:, :3], np.array(mesh.tri_verts, np.int64), name)
+        vertices = np.array(mesh.vert_properties)[:, :3] @ _UNSHEARED
+        return Surface(vertices, np.array(mesh.tri_verts, np.int64), name)
 
 
 def _with_groups(made: Surface, given: Surface, groups: np.ndarray, reach: float) -> tuple[Surface, np.ndarray]:
