@@ -6,7 +6,8 @@
 For each number of ranks the script starts itself under `mpiexec`; with PoCL each rank has one core. `bits` says whether
 the diagram of random points has the same bits as with the first number of ranks. The other columns are of a run in a
 box, on a sphere, or in a lake, with sizes from h to 3 h, after the same run once, which loads kernels. `CPU s` is
-the processor time of its work, summed over ranks, and `over one` the ratio to that of the first number of ranks.
+the processor time of its work, summed over ranks, `host` the part of it that is not kernels and copies on the device,
+and `over one` the ratio of `CPU s` to that of the first number of ranks.
 `waiting` is the processor time of waits for other ranks, which ask and sleep by turns; ranks with a core of their own
 wait less. `reading` is that of reading the cells afterwards. `floor` is the ratio for as many processes at the same
 time that each make a mesh of n / p cells without messages: it has the cost of the fixed work of a step, and of shared
@@ -48,6 +49,7 @@ COLUMNS = {
     "bits": shown("bits", "s"),
     "mean e": shown("error", ".4f"),
     "CPU s": shown("cpu", ".1f"),
+    "host": shown("host", ".1f"),
     "waiting": shown("waiting", ".1f"),
     "reading": shown("reading", ".1f"),
     "over one": shown("over_one", ".2f"),
@@ -127,25 +129,28 @@ def measure_rank(options: argparse.Namespace) -> None:
     factor = {2: 2 / 3, 3: (13 / 27) ** 0.5}[dim]
     h = factor * (domain.measure / cells) ** (1 / dim)
 
-    def run(by: clvoro.Adapter, h: float) -> tuple[clvoro.Result, float, float]:
-        """Return the mesh, and processor time of work and of waits over all ranks."""
+    def run(by: clvoro.Adapter, h: float) -> tuple[clvoro.Result, np.ndarray]:
+        """Return the mesh, and processor time over all ranks: of work, of its part on the host, of waits."""
+
+        def clocks() -> np.ndarray:
+            return np.array([time.process_time() - waited[0], time.thread_time() - waited[0], waited[0]])
+
         comm.Barrier()
-        began, waits = time.process_time(), waited[0]
+        began = clocks()
         mesh = by.run(domain, lambda p: h * (1 + 2 * (p[:, 0] - domain.lower[0])), effort)
-        waits = waited[0] - waits
-        return mesh, comm.allreduce(time.process_time() - began - waits), comm.allreduce(waits)
+        return mesh, comm.allreduce(clocks() - began)
 
     run(adapter, h)
     single = clvoro.Adapter(adapter.ctx, options.dtype, comm=MPI.COMM_SELF)
     run(single, 4 * h)
-    least = run(single, h * comm.size ** (1 / dim))[1]
+    least = run(single, h * comm.size ** (1 / dim))[1][0]
     rounds.clear()
     calls.clear()
     asked[0] = 0
     del found, single
     gc.collect()
     memory_limits.MOST_TAKEN.clear()
-    mesh, spent, waits = run(adapter, h)
+    mesh, (spent, host, waits) = run(adapter, h)
     began = time.process_time()
     _ = [getattr(mesh.diagram, name) for name in clvoro.Diagram._NAMES if name in dir(mesh.diagram)]
     reading = comm.allreduce(time.process_time() - began)
@@ -164,6 +169,7 @@ def measure_rank(options: argparse.Namespace) -> None:
             "digest": digest.hexdigest(),
             "error": float(last["mean_error"]),
             "cpu": spent,
+            "host": host,
             "waiting": waits,
             "reading": reading,
             "least": least,
