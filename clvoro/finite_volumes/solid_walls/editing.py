@@ -533,8 +533,8 @@ def _region(edits: Edits, cells: tuple[int, ...]) -> _Region:
         counts.append(len(loop))
         corners += loop
     vertices, rows = np.unique(np.array(corners, np.int64), return_inverse=True)
-    made = (np.array(x, np.int64) for x in (owner, neighbor, counts))
-    return _Region(*made, rows, vertices.tolist(), list(number)[len(cells) :])
+    one, other, count = (np.array(x, np.int64) for x in (owner, neighbor, counts))
+    return _Region(one, other, count, rows, vertices.tolist(), list(number)[len(cells) :])
 
 
 def over_wanted(measures: SolverMeasures) -> np.ndarray:

@@ -73,11 +73,11 @@ class WallSurface:
         keys, known, *answers = self._known
         row = np.minimum(np.searchsorted(keys, key), len(keys) - 1)
         new = np.flatnonzero((keys[row] != key) | (known[row] != points).any(axis=1))
-        found = tuple(answer[row] for answer in answers)
+        triangle, foot, distance = (answer[row] for answer in answers)
         if len(new):
             asked = points[new]
-            for answer, made in zip(found, self.solid.closest(asked, self._triangles(asked)), strict=True):
-                answer[new] = made
+            triangle[new], foot[new], distance[new] = self.solid.closest(asked, self._triangles(asked))
+        found = triangle, foot, distance
         self._kept += [(points, *found)] if sum(len(x) for x, *_ in self._kept) < _MOST_KEPT else []
         return found
 
