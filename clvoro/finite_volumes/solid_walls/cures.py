@@ -57,7 +57,7 @@ _OBLIQUE = 100
 """Most searches at oblique faces, besides one for each cell that has such faces."""
 _AHEAD = 1
 """Where no cure of a cell helps, cures of the cells that OpenFOAM rejects after it may follow: how many in turn."""
-_BRANCHES, _MOST_BAD = 2, 3
+_BRANCHES, _MORE_BRANCHES, _MOST_BAD = 2, 6, 3
 """After how many of the cures of a cell others are tried, of those with oblique faces that are left then, and for how
 many rejected cells."""
 
@@ -79,6 +79,7 @@ class Cures:
     - `edits`: the mesh with all changes that are kept.
     - `searches`: how often cures have been tried on a cell, also by the earlier cures.
     - `most`: the number of searches after which no cure is tried.
+    - `branches`: after how many of the cures of a cell others are tried.
     """
 
     def __init__(
@@ -91,8 +92,8 @@ class Cures:
         strictly: bool = False,
     ) -> None:
         self.surface, self.edits, self.names, self.sizes = surface, Edits(faces), names, sizes
-        self.changes, self.searches, self.changed, self.tried = 0, 0, dict[int, int](), dict[int, int]()
-        self.most, self.strictly = _MOST, strictly
+        self.changes, self.searches, self.changed, self.tried = 0, 0, dict[int, int](), dict[int, tuple[int, int]]()
+        self.most, self.branches, self.strictly = _MOST, _BRANCHES, strictly
         self.excess: dict[int, tuple[int, float]] = {}
         self.judged: dict[tuple[Edits, int, bool], list[Option]] = {}
         self.concave: dict[tuple[Edits, int], list[tuple[float, Edge, int, int, np.ndarray]]] = {}
@@ -107,10 +108,10 @@ class Cures:
         self.changes, self.searches = earlier.changes, earlier.searches
         self.changed = {cells[c]: when for c, when in earlier.changed.items() if c in cells}
         changed = old.touched
-        for c, when in earlier.tried.items():
+        for c, (when, branches) in earlier.tried.items():
             around = {c, *old.neighbors(c)}
             if when == earlier.stamp(c) and all(n in cells or (n not in changed and matches.find(n)) for n in around):
-                self.tried[cells[c] if c in cells else matches.cells[c]] = when
+                self.tried[cells[c] if c in cells else matches.cells[c]] = when, branches
 
     @property
     def are_spent(self) -> bool:
@@ -124,7 +125,9 @@ class Cures:
     def cure(self, cell: int) -> bool:
         """Make the best change to the mesh around a cell if it is rejected; return whether one helps."""
         edits = self.edits
-        if not edits.faces_of(cell) or self.tried.get(cell) == self.stamp(cell) or self.searches >= self.most:
+        when, branches = self.tried.get(cell, (-1, 0))
+        known = when == self.stamp(cell) and branches >= self.branches
+        if known or not edits.faces_of(cell) or self.searches >= self.most:
             return False
         self.measure([cell])
         if self.excess[cell][1] == 0:
@@ -137,7 +140,7 @@ class Cures:
                 self.changes += 1
                 self.changed |= dict.fromkeys(found[1].touched, self.changes)
                 return True
-        self.tried[cell] = self.stamp(cell)
+        self.tried[cell] = self.stamp(cell), self.branches
         return False
 
     def work_on(self, cells: list[int]) -> None:
@@ -192,7 +195,7 @@ class Cures:
             return gain, trial
         if not ahead:
             return None
-        for gain, trial, bad in sorted(options, key=lambda o: o[0][1])[:_BRANCHES]:
+        for gain, trial, bad in sorted(options, key=lambda o: o[0][1])[: self.branches]:
             for c in bad[:_MOST_BAD]:
                 if trial.faces_of(c) and (further := self._best(trial, c, ahead - 1, last)) is not None:
                     gain = (gain[0] + further[0][0], gain[1] + further[0][1], max(gain[2], further[0][2]))
@@ -555,7 +558,8 @@ def cured(
     cures = Cures(surface, faces, names, sizes, earlier, oblique is not None)
     if oblique is not None:
         cures.most = cures.searches + _OBLIQUE + len(begun)
-    cures.work_on(begun)
+    for cures.branches in (_BRANCHES,) if oblique is None else (_BRANCHES, _MORE_BRANCHES):
+        cures.work_on(begun)
     made, cells, left = cures.result(rejected)
     if len(left) > len(rejected):
         return faces, np.arange(faces.n_cells), own, rejected, None

@@ -54,7 +54,7 @@ _MANY, _SHARE = 250, 0.05
 """So many rejected cells, and such a share of those at walls, are more than cures can mend in a time like the run's:
 they stay as they are."""
 _GOLDEN = (5**0.5 - 1) / 2
-_SIMPLER, _SIMPLER_AFTER = 3, 1
+_SIMPLER, _SIMPLER_AFTER = 3, 2
 """How often walls of rejected cells become simpler, at first and after each move of generators."""
 _BESIDE = 1.3
 """Distance over h up to which walls become simpler around rejected cells whose walls have no creases any more."""
