@@ -370,19 +370,20 @@ def _warn_of(mesh: _Made, home: np.ndarray) -> None:
     if _are_many(near, mesh.rejected):
         wrap = np.median(near.sizes[mesh.home[mesh.rejected]]) / 1.5
         remedy = f", or leave out details finer than cells, as Solid(..., wrap={wrap:.2g}) and Solid.read do"
-    for rows, text in (
-        (points[lost], "generators at {} have no cell: the solid is thinner than a cell, which is left out"),
-        (points[-1 - home[home < 0]], "cells at {} are parts of others, cut where these were concave"),
+    for rows, what, why in (
+        (points[lost], "generators without a cell", "the solid is thinner than a cell, which is left out"),
+        (points[-1 - home[home < 0]], "cells that are parts of others", "these were concave, and are cut"),
         (
             near.generators[mesh.walls >= FILLED],
-            "cells at {} leave out creases or corners, of which several meet within a cell",
+            "cells that leave out creases or corners",
+            "several of these meet within a cell",
         ),
-        (rejected, "cells at {} are concave, inverted, or as thin as the solid, and OpenFOAM does not accept them"),
+        (rejected, "cells that are concave, inverted, or as thin as the solid", "OpenFOAM does not accept them"),
     ):
         if len(rows):
-            place = format_point(rows[0]) + (" and elsewhere" if len(rows) > 1 else "")
+            place = f"{len(rows)}, the first at {format_point(rows[0])}"
             more = remedy if rows is rejected else ""
-            warn(f"{len(rows)} {text.format(place)}; use smaller sizes there{more}", MismatchWarning)
+            warn(f"the mesh has {what} ({place}): {why}; use smaller sizes there{more}", MismatchWarning)
 
 
 def _check_lost(surface: WallSurface, near: NearWalls, home: np.ndarray) -> None:
