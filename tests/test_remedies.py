@@ -1054,7 +1054,7 @@ TESTED_IN = {
     "surfaces are in space": "adaptation/test_surfaces.py::test_what_is_refused_at_the_door",
     "cross or cover each other": "adaptation/test_surfaces.py::test_what_is_refused_at_the_door",
     "surfaces are smaller": "adaptation/test_surfaces.py::test_surfaces_without_room_are_refused_with_the_place",
-    "got a shape with the length": "sizing/test_sizing.py::test_distance_to_geometries_of_shapely",
+    "got a shape with the length": "sizing/test_sizing.py::test_distance_to_geometries_of_shapely_and_geojson",
     "has an extent of , expected  to ": "geometry/test_curves.py::test_what_is_no_curve",
     "has no place for ": "geometry/solid/test_files_and_booleans.py::test_wrong_options_are_refused",
     "a space that is closed but for gaps": "geometry/solid/test_files_and_booleans.py::test_wrong_options_are_refused",

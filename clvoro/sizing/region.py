@@ -58,12 +58,12 @@ class Region(Distance):
     def __init__(
         self, shapes: Any, h: float, growth: float | None = None, h_max: float = math.inf, slope: float | None = None
     ):
-        one = isinstance(shapes, GeoJSON | Surface | Domain) or not isinstance(shapes, Iterable)
-        several: Any = [shapes] if one else shapes
-        given: list[Any] = []
-        for shape in several:
-            given += geometries_of_geojson(shape) if isinstance(shape, GeoJSON) else [shape]
+        given: Any = [shapes] if isinstance(shapes, GeoJSON) else shapes
+        if isinstance(given, Iterable) and not isinstance(given, Surface | Domain):
+            parts = [geometries_of_geojson(s) if isinstance(s, GeoJSON) else [s] for s in given]
+            given = [shape for part in parts for shape in part]
         super().__init__(given, h, growth, h_max, slope)
+        given = given if isinstance(given, list) else [given]
         self.shapes = tuple(given)
         dim = int(self.dim or 0)
         made: list[Any] = [{2: _area_of, 3: _solid_of}[dim](shape) for shape in given]
