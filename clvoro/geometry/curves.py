@@ -31,7 +31,7 @@ def angles(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 LARGEST_TURN = math.radians(2)
 """Largest turn of a smooth curve from one edge of its polyline to the next."""
 SAMPLES = 64
-"""Least number of intervals that show the shape of a span."""
+"""Least number of equal intervals of the parameter over which the turns of a span are measured."""
 _MOST_SAMPLES = 1 << 16
 _SAMPLE_TURN = 0.1  # radians between samples, at most, up to `_MOST_SAMPLES`
 _MOST_EDGES = 1 << 20  # of one span
@@ -48,7 +48,7 @@ class Span:
     at: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
     """Takes parameters (n,) and returns points (n, 2) and derivatives (n, 2) by the parameter."""
     samples: int = SAMPLES
-    """Number of intervals that show the shape of the span."""
+    """Number of equal intervals of the parameter over which turns are measured at first."""
 
     def nearest(self, points: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
         """Return the parameters (n,) from `lower` to `upper`, (n,) each, of the nearest points to `points` (n, 2).
@@ -111,7 +111,7 @@ class Span:
 
 
 def check_point(what: str, value: ArrayLike) -> list[float]:
-    """Return two finite numbers."""
+    """Return `value` as two finite numbers, (2,) float; errors call it `what`."""
     try:
         array = np.asarray(value, dtype=float)
     except (TypeError, ValueError) as error:

@@ -38,18 +38,6 @@ Shape = Curve | Surface | Domain
 GeoJSON = str | PathLike | Mapping
 
 
-def _shapes_in(given: Any) -> list[Any]:
-    """Return the shapes that a geometry of shapely or GeoJSON stands for, or else what is given."""
-    if isinstance(given, shapely.Geometry):
-        return list(shapes_of(given))
-    if isinstance(given, GeoJSON):
-        found = [shape for geometry in geometries_of_geojson(given) for shape in shapes_of(geometry)]
-        if not found:
-            raise InputError(f"{given!s:.60} has no geometries, expected points, lines or polygons")
-        return found
-    return [given]
-
-
 class Distance(Field):
     r"""Size that grows with the distance to shapes: ``h = min(h_min + slope * distance, h_max)``.
 
@@ -101,7 +89,10 @@ class Distance(Field):
                 f"such as {name}(Circle((0.5, 0.5), 0.1), 0.01, growth=1.2)"
             )
         given: Any = [shapes] if isinstance(shapes, (Shape, shapely.Geometry, GeoJSON)) else shapes
-        self.shapes: tuple[Any, ...] = tuple(shape for some in given for shape in _shapes_in(some))
+        parts = [geometries_of_geojson(s) if isinstance(s, GeoJSON) else [s] for s in given]
+        self.given: list[Any] = [shape for part in parts for shape in part]
+        parts = [shapes_of(s) if isinstance(s, shapely.Geometry) else [s] for s in self.given]
+        self.shapes: tuple[Any, ...] = tuple(shape for part in parts for shape in part)
         for shape in self.shapes:
             if not isinstance(shape, Shape):
                 bare = isinstance(shape, list | tuple | np.ndarray | Real)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,10 +12,9 @@ from ..errors import InputError, InputTypeError
 from ..geometry import curves
 from ..geometry.bvh import Tree
 from ..geometry.domain import Domain
-from ..geometry.geojson import geometries_of_geojson
 from ..geometry.shapes import Circle, ClosedPolyline
 from ..geometry.surface import Surface
-from .distance import Distance, GeoJSON
+from .distance import Distance
 
 if TYPE_CHECKING:
     from .codegen import CodeWriter
@@ -58,15 +56,10 @@ class Region(Distance):
     def __init__(
         self, shapes: Any, h: float, growth: float | None = None, h_max: float = math.inf, slope: float | None = None
     ):
-        given: Any = [shapes] if isinstance(shapes, GeoJSON) else shapes
-        if isinstance(given, Iterable) and not isinstance(given, Surface | Domain):
-            parts = [geometries_of_geojson(s) if isinstance(s, GeoJSON) else [s] for s in given]
-            given = [shape for part in parts for shape in part]
-        super().__init__(given, h, growth, h_max, slope)
-        given = given if isinstance(given, list) else [given]
-        self.shapes = tuple(given)
+        super().__init__(shapes, h, growth, h_max, slope)
+        self.shapes = tuple(self.given)
         dim = int(self.dim or 0)
-        made: list[Any] = [{2: _area_of, 3: _solid_of}[dim](shape) for shape in given]
+        made: list[Any] = [{2: _area_of, 3: _solid_of}[dim](shape) for shape in self.given]
         self.areas, self.solids = {2: (made, []), 3: ([], made)}[dim]
 
     def contains(self, points: np.ndarray) -> np.ndarray:

@@ -148,7 +148,7 @@ class Bins:
         """Sort the first `n` of `points` (n, d; normalized coordinates, within `box`) into bins.
 
         In a power diagram rows of `points` end with weights. The host reads two integers per level, at once; uniform
-        sets have one level.
+        sets have one level. On ranks it reads the points of its part as well, for their extent.
         """
         engine, k, d = self.engine, self._kernels, self.engine.dim
         lower, upper = (corner.astype(np.float64)[:d] for corner in box.device_corners(engine.real))

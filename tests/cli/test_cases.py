@@ -316,10 +316,11 @@ def test_fixed_generators_are_positions_or_a_file(tmp_path):
     for read in (*cases, load_case(cases[2].write(out))):
         assert np.array_equal(read.run_arguments()["fixed"], at)
         assert read.size_field()([(0.5, 0.25), (1, 0.5), (1, 0.9)]) == pytest.approx([0.1, 0.1, 0.18])
-    with pytest.raises(InputError, match=r"run\.fixed names .*river\.geojson' with a LineString, expected points"):
+    with pytest.raises(InputError, match=r"run\.fixed names .*river\.geojson' with LineString, expected points"):
         case(f"{size}fixed = 'river.geojson'", tmp_path).run_arguments()
-    (tmp_path / "wells.csv").write_text("x, y\n1, deep\n")
-    with pytest.raises(InputError, match=r"run\.fixed names .*expected columns x and y with numbers"):
-        cases[2].run_arguments()
+    for table, why in {"x, y\n1, deep\n": "deep", "easting, y\n1, 2\n": "easting", "": "none"}.items():
+        (tmp_path / "wells.csv").write_text(table)
+        with pytest.raises(InputError, match=rf"run\.fixed names .*{why}.*expected columns x and y, or lon and lat"):
+            cases[2].run_arguments()
     with pytest.raises(InputError, match=r"run\.fixed.*a text in quotes or a list"):
         case(f"{size}fixed = 0.5")

@@ -322,7 +322,7 @@ def test_distance_to_geometries_of_shapely_and_geojson():
         assert sizing.Distance(shapes, 1, slope=0.5)(points) == pytest.approx(expected, rel=1e-12)
     with pytest.raises(InputError, match="not empty"):
         sizing.Distance(shapely.Polygon(), 1, slope=0.5)
-    with pytest.raises(InputError, match="no geometries, expected points, lines or polygons"):
+    with pytest.raises(InputError, match="got no shapes, expected at least one"):
         sizing.Distance({"type": "FeatureCollection", "features": []}, 1, slope=0.5)
     with pytest.raises(InputError, match=r"length 1e\+160, expected at most"):
         sizing.Distance(shapely.Point(0, 1e160), 1, slope=0.5)

@@ -473,19 +473,24 @@ def load_points(path: Path, place: str) -> np.ndarray:
     """
     if path.suffix.lower() in (".json", ".geojson"):
         shapes = list(geometries_of_geojson(path))
-        if wrong := {shape.geom_type for shape in shapes} - {"Point", "MultiPoint"}:
-            raise InputError(f"{place} names {str(path)!r} with a {min(wrong)}, expected points alone")
+        wrong = {shape.geom_type for shape in shapes} - {"Point", "MultiPoint"}
+        if wrong or not shapes:
+            raise InputError(f"{place} names {str(path)!r} with {min(wrong, default='nothing')}, expected points alone")
         return shapely.get_coordinates(shapes)
     if path.suffix.lower() != ".csv":
         return load_array(path, place)
     try:
         rows = list(csv.DictReader(read_text(path, LONGEST_GEOMETRY).splitlines()))
         columns = {name.strip().lower(): name for name in (rows[0] if rows else {}) if name}
-        names = [columns[name] for name in ("x", "y", "z", "lon", "lat") if name in columns]
-        return np.array([[row[name] for name in names] for row in rows], float).reshape(len(rows), -1)
+        wanted = ("x", "y", "z") if "x" in columns else ("lon", "lat")
+        names = [columns[name] for name in wanted if name in columns]
+        if len(names) < 2:
+            raise ValueError(f"its columns are {', '.join(columns) or 'none'}")
+        return np.array([[row[name] for name in names] for row in rows], float)
     except (OSError, TypeError, ValueError) as error:
         raise InputError(
-            f"{place} names {str(path)!r}, which cannot be read ({error}), expected columns x and y with numbers"
+            f"{place} names {str(path)!r}, which cannot be read ({error}), expected columns x and y, or lon and lat, "
+            "with numbers"
         ) from error
 
 
