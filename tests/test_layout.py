@@ -25,7 +25,7 @@ ORDER = (
     "errors",
     "arguments",
     "files",
-    "graphs",
+    "connectivity",
     "opencl",
     "geometry",
     "curves",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pyopencl.array as cla
 
+from ..connectivity import rows_and_places
 from ..geometry.domain import Domain
 from ..geometry.polygon import Polygon
 from ..opencl.engine import Engine
@@ -22,8 +23,7 @@ def has_thin_walls(domain: Polygon, h: np.ndarray) -> bool:
     begin, edge, length = oriented.vertices, oriented.along, oriented.lengths
     least = np.minimum(h, h[oriented.next_vertex])
     counts = np.ceil(length / (0.5 * least)).clip(1, MOST_SAMPLES).astype(int)
-    rows = np.repeat(np.arange(len(begin)), counts)
-    place = np.arange(len(rows)) - np.repeat(np.cumsum(counts) - counts, counts)
+    rows, place = rows_and_places(counts)
     share = ((place + 0.5) / counts[rows])[:, None]
     at = begin[rows] + share * edge[rows]
     outward = np.column_stack([edge[:, 1], -edge[:, 0]])[rows] * (least / length)[rows, None]

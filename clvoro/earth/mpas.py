@@ -13,10 +13,10 @@ from pathlib import Path
 import numpy as np
 
 from ..arguments import format_point
+from ..connectivity import components
 from ..errors import InputError
 from ..geometry.domain import Domain
 from ..geometry.sphere import Sphere, triangle_areas
-from ..graphs import components
 from ..io.contents import Contents
 from ..io.netcdf import NetCDF, squared
 from ..mesh.diagram import Diagram

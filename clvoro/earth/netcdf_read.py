@@ -12,12 +12,11 @@ from typing import Any
 import numpy as np
 import scipy
 
+from ..connectivity import components, following, starts_of
 from ..files import open_plain
 from ..geometry.sphere import EARTH_RADIUS, Sphere, SphereRegion, triangle_areas
-from ..graphs import components
 from ..io.arrays import FileError, explained
 from ..mesh.check.rebuilt import rebuild_on_sphere
-from ..mesh.connectivity import following
 from ..mesh.diagram import Diagram
 from ..mesh.results import Result, result_of_file
 
@@ -63,7 +62,7 @@ def make_diagram(cells: MeshInFile) -> Diagram:
             raise FileError(f"{name}[{k}] is {places[k]}, not on the sphere of radius {radius:g}")
     if cells.counts.min() < 2:
         raise FileError(f"cell {cells.counts.argmin()} has {cells.counts.min()} corners")
-    starts = np.concatenate([[0], np.cumsum(cells.counts)])
+    starts = starts_of(cells.counts)
     owner = np.repeat(np.arange(n), cells.counts)
     ends = np.stack([cells.corners, cells.corners[following(starts)]], axis=1)
     x, v = cells.points / radius, cells.vertices / radius
@@ -232,7 +231,7 @@ def read_mpas(file: Variables) -> MeshInFile | None:
     of_faces = _ragged(file.integer("edgesOnCell"), counts, len(edges), 1, "edgesOnCell")
     # Vertex k of a cell lies between its edges k and k + 1, so that it ends edge k.
     corners = np.empty_like(ends)
-    corners[following(np.concatenate([[0], np.cumsum(counts)]))] = ends
+    corners[following(starts_of(counts))] = ends
     return MeshInFile(radius, points, vertices, counts, corners, edges[of_faces])
 
 

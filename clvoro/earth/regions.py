@@ -19,10 +19,9 @@ import numpy as np
 import scipy
 
 from ..arguments import check_choice, check_integer, warn
+from ..connectivity import components, following
 from ..errors import InputError, InputTypeError, MismatchWarning
 from ..geometry.sphere import Sphere, SphereRegion
-from ..graphs import components
-from ..mesh.connectivity import following
 from ..mesh.diagram import Diagram
 from ..mesh.results import Result
 from ..mesh.subset import check_mask

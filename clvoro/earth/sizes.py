@@ -10,6 +10,7 @@ import shapely
 from numpy.typing import ArrayLike
 
 from ..arguments import check_number, warn
+from ..connectivity import rows_and_places
 from ..errors import InputError, InputTypeError, MismatchWarning
 from ..geometry.box import Box
 from ..geometry.domain import Domain
@@ -236,8 +237,7 @@ class ArcDistance(Distance):
         length = np.radians(np.hypot(*(end - begin).T))
         longest = max(longest, length.sum() / MOST_CHORDS)
         counts = np.maximum(np.ceil(length / longest), 1).astype(int)
-        rows = np.repeat(np.arange(len(begin)), counts)
-        place = np.arange(len(rows)) - np.repeat(np.cumsum(counts) - counts, counts)
+        rows, place = rows_and_places(counts)
         step = ((end - begin) / counts[:, None])[rows]
         ends = begin[rows] + place[:, None] * step
         self._begin, self._end = sphere.positions(ends), sphere.positions(ends + step)

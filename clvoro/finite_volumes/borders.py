@@ -8,10 +8,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ..connectivity import distinct, following, rows_of, rows_with, starts_of, take_rows
 from ..errors import InputError
 from ..geometry.solid.creases import connect
 from ..geometry.surfaces.sheets import Sheets
-from ..mesh.connectivity import distinct, following, rows_with, take_rows
 from ..mesh.diagram import Diagram
 from ..mesh.faces import Faces
 from ..mesh.geometry import sum_rows
@@ -235,7 +235,7 @@ def _with_pairs_only(mesh: Faces, rows: np.ndarray, small: np.ndarray, vertices:
     place = np.full(len(mesh.points), -1)
     place[vertices] = np.arange(len(vertices))
     at = place[mesh.corners]
-    face = np.repeat(np.arange(len(mesh)), np.diff(mesh.starts))
+    face = rows_of(mesh.starts)
     at, face = at[at >= 0], face[at >= 0]
     other = mesh.neighbor[face]
     both = [np.stack([at, number[mesh.owner[face]]], axis=1)[on_border[mesh.owner[face]]]]
@@ -262,7 +262,7 @@ def _with_pairs_only(mesh: Faces, rows: np.ndarray, small: np.ndarray, vertices:
 
 def _relabeled(mesh: Faces, to: np.ndarray) -> Faces:
     """Return a mesh with vertices replaced by the vertices `to` (v,); faces with less than three are left out."""
-    touched = np.unique(np.repeat(np.arange(len(mesh)), np.diff(mesh.starts))[to[mesh.corners] != mesh.corners])
+    touched = np.unique(rows_of(mesh.starts)[to[mesh.corners] != mesh.corners])
     corners, stays = to[mesh.corners].astype(np.int32), np.ones(len(mesh.corners), bool)
     for begin, end in zip(mesh.starts[touched].tolist(), mesh.starts[touched + 1].tolist(), strict=True):
         left = _without_spikes(list(zip(corners[begin:end].tolist(), range(begin, end), strict=True)))
@@ -270,7 +270,7 @@ def _relabeled(mesh: Faces, to: np.ndarray) -> Faces:
         stays[[place for _, place in left]] = len(left) > 2
     counts = np.add.reduceat(stays, mesh.starts[:-1], dtype=np.int64)
     rows = np.flatnonzero(counts)
-    starts = np.concatenate([[0], np.cumsum(counts[rows])])
+    starts = starts_of(counts[rows])
     return mesh.take_faces(rows, starts=starts, corners=corners[stays]).compact()
 
 

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..graphs import components
-from ..mesh.connectivity import distinct, following, slices, take_ranges, take_rows
+from ..connectivity import components, distinct, following, rows_of, slices, starts_of, take_ranges, take_rows
 from ..mesh.diagram import Diagram
 from ..mesh.faces import Faces
 from ..mesh.geometry import cross_columns, dots, lengths, smaller_size, sum_columns
@@ -186,7 +185,7 @@ class _Scan:
     def __init__(self, cells: MergingCells, faces: np.ndarray) -> None:
         self.cells, self.faces = cells, faces[cells.count[faces] > 0]
         self.starts, places = cells.face_corners(self.faces)
-        face = np.repeat(np.arange(len(self.faces)), np.diff(self.starts))
+        face = rows_of(self.starts)
         x = cells.positions(cells.corners[places], cells.codes[places])
         after = following(self.starts)
         h = smaller_size(cells.owner[self.faces], cells.neighbor[self.faces], cells.sizes)
@@ -220,7 +219,7 @@ class _Scan:
         """Return the approximate skewness of some of the faces, all between two cells."""
         c, faces = self.cells, self.faces[rows]
         starts, places = take_rows(self.starts, np.arange(x.shape[1]), rows)
-        face = np.repeat(np.arange(len(rows)), np.diff(starts))
+        face = rows_of(starts)
         x, n = x.take(places, axis=1), normals[:, rows]
         center = sum_columns(face, x, len(rows)) / np.diff(starts)
         own, other = c.centroids[c.owner[faces]].T, c.centroids[c.neighbor[faces]].T
@@ -241,7 +240,7 @@ class _Scan:
         h = np.full(k, np.inf)
         np.minimum.at(h, label[i], self.h[self.short])
         order = np.argsort(label, kind="stable")
-        starts = np.concatenate([[0], np.cumsum(np.bincount(label, minlength=k))])
+        starts = starts_of(np.bincount(label, minlength=k))
         return self._sets(starts, vertices[order], h)
 
     def small_faces(self) -> Merges:
@@ -255,7 +254,7 @@ class _Scan:
         wanted = self.short & (self.begin != self.end)
         rows = np.flatnonzero(self.small)
         if len(rows):
-            face = np.repeat(np.arange(len(self.faces)), np.diff(self.starts))
+            face = rows_of(self.starts)
             order = np.lexsort((self.length, face))
             wanted[order[self.starts[rows]]] = True
         i, j = self.begin[wanted], self.end[wanted]
@@ -267,7 +266,7 @@ class _Scan:
 
     def slivers(self) -> Merges:
         """Return the ends of the short sides of faces that vanish if all of them become points."""
-        face = np.repeat(np.arange(len(self.faces)), np.diff(self.starts))
+        face = rows_of(self.starts)
         left = np.diff(self.starts) - np.bincount(face[self.short], minlength=len(self.faces))
         several = np.diff(self.starts) - left > 1
         rows = np.flatnonzero(self.short & ((left < 3) & several)[face])
@@ -290,7 +289,7 @@ class _Scan:
         """Return those groups of vertices that are close together; each is a set, or has its place in `sets`."""
         g = len(starts) - 1
         sets = np.arange(g) if sets is None else sets
-        group = np.repeat(np.arange(g), np.diff(starts))
+        group = rows_of(starts)
         x = self.cells.points[vertices]
         away = x - x[starts[:-1]][group]
         steps = np.rint(away / self.cells.extent)

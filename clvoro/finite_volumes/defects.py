@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..mesh.connectivity import distinct, following, slices, take_rows
+from ..connectivity import distinct, following, rows_of, slices, take_rows
 from ..mesh.geometry import cross_columns, dots, lengths, loop_geometry, pyramid_sums, smaller_size
 
 if TYPE_CHECKING:
@@ -151,7 +151,7 @@ def _bad_tetrahedra(around: Neighborhood, x: np.ndarray, shapes: _Shapes) -> np.
     origins = shapes.middles.take(around.side_cell[around.star], axis=1)
     origins = origins + around.whole.offsets(around.side_code[around.star])
     starts, place = take_rows(around.starts, np.arange(x.shape[1]), face)
-    side, after = np.repeat(np.arange(len(face)), np.diff(starts)), following(starts)
+    side, after = rows_of(starts), following(starts)
     y = x.take(place, axis=1) - origins.take(side, axis=1)
     normal = cross_columns(y, y.take(after, axis=1)) * sign[side]
     height = shapes.centers.take(face, axis=1) - origins
@@ -193,7 +193,7 @@ def _quality(around: Neighborhood, x: np.ndarray, shapes: _Shapes) -> tuple[np.n
     size = lengths(off)
     along = off / np.maximum(size, 1e-300)
     starts, place = take_rows(around.starts, np.arange(len(around.corners)), rows)
-    row = np.repeat(np.arange(len(rows)), np.diff(starts))
+    row = rows_of(starts)
     reach = np.where(inner, 0.2, 0.4) * length
     arms = x.take(place, axis=1) - center.take(row, axis=1)
     extent = np.abs(dots(along.take(row, axis=1), arms))

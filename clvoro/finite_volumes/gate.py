@@ -9,8 +9,7 @@ from typing import Literal
 import numpy as np
 
 from ..arguments import check_choice, format_point
-from ..graphs import components
-from ..mesh.connectivity import following
+from ..connectivity import components, following, rows_of
 from ..mesh.diagram import Diagram
 from ..mesh.faces import Faces
 from ..mesh.geometry import turns
@@ -233,7 +232,7 @@ def rejected_polygons(mesh: Faces) -> np.ndarray:
 def not_convex(mesh: Faces, least: float) -> np.ndarray:
     """Return which cells in 2D are no simple polygons, or turn left by less than `least` in a corner, (n,) bool."""
     starts, loop, broken = simple_loops(mesh)
-    cell = np.repeat(np.arange(mesh.n_cells), np.diff(starts))
+    cell = rows_of(starts)
     turn = turns(mesh.points[loop], following(starts))
     found = np.bincount(cell, turn, mesh.n_cells) > 3 * np.pi  # 4 pi if sides cross
     found[broken] = found[cell[turn < least]] = True

@@ -6,7 +6,7 @@ from functools import cached_property
 
 import numpy as np
 
-from ..mesh.connectivity import following, slices, take_rows
+from ..connectivity import following, rows_of, slices, starts_of, take_rows
 from ..mesh.faces import Faces
 from ..mesh.geometry import Geometry, cell_geometry, cross_columns, dots, lengths, polygon_sides, smaller_size, sum_rows
 from ..mesh.straightening import cross
@@ -112,7 +112,7 @@ class SolverMeasures:
         extent = least
         for part in slices(len(extent), _CHUNK):
             starts = p.starts[part.start : part.stop + 1]
-            face = np.repeat(np.arange(part.start, part.start + len(starts) - 1), np.diff(starts))
+            face = part.start + rows_of(starts)
             arms = p.points.take(p.corners[starts[0] : starts[-1]], axis=0) - g.centers[face]
             reach = np.abs(np.einsum("ij,ij->i", arms, direction[face]))
             extent[part] = np.maximum(np.maximum.reduceat(reach, starts[:-1] - starts[0]), least[part])
@@ -221,7 +221,7 @@ class SolverMeasures:
         places = self.cells.cell_faces()[1]
         places = places if judged is None else places[judged[cell[places]]]
         cell, face = cell[places], face[places]
-        starts = np.concatenate([[0], np.cumsum(np.bincount(cell, minlength=self.mesh.n_cells))])
+        starts = starts_of(np.bincount(cell, minlength=self.mesh.n_cells))
         centers = np.ascontiguousarray(self.geometry.centers[face].T)
         areas = np.ascontiguousarray((self.geometry.areas[face] * sign[places, None]).T)
         i, j = concave_pairs(centers, areas, starts, limit, np.ones(len(face), bool))
@@ -236,7 +236,7 @@ class SolverMeasures:
         g, p, (cell, face, sign) = self.geometry, self.cells, self.face_cells
         edge = self.edge_of_corner
         starts, places = take_rows(p.starts, np.arange(len(p.corners)), face)
-        side = np.repeat(np.arange(len(face)), np.diff(starts))
+        side = rows_of(starts)
         order = np.lexsort((edge[places], cell[side]))
         places, side = places[order], side[order]
         pairs = np.flatnonzero((np.diff(edge[places]) == 0) & (np.diff(cell[side]) == 0))
@@ -311,7 +311,7 @@ class SolverMeasures:
         left, base = np.arange(len(faces)), 0
         while left.size:
             begin, items = take_rows(starts, np.arange(len(corners)), left)
-            row = np.repeat(np.arange(len(left)), np.diff(begin))
+            row = rows_of(begin)
             apart = (np.arange(len(items)) - begin[row] - base) % counts[left][row]
             used = (apart > 0) & (apart < counts[left][row] - 1)
             items, row = items[used], row[used]

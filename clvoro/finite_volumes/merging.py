@@ -11,7 +11,7 @@ from functools import cached_property
 
 import numpy as np
 
-from ..mesh.connectivity import distinct, independent, take_ranges, take_rows
+from ..connectivity import distinct, independent, rows_of, starts_of, take_ranges, take_rows
 from ..mesh.diagram import Diagram
 from ..mesh.faces import Faces
 from ..mesh.geometry import lengths, loop_geometry, sum_columns
@@ -47,7 +47,7 @@ class Merges:
     @cached_property
     def group(self) -> np.ndarray:
         """Group of each vertex."""
-        return np.repeat(np.arange(len(self.sets)), np.diff(self.starts))
+        return rows_of(self.starts)
 
     @property
     def heads(self) -> np.ndarray:
@@ -200,7 +200,7 @@ class MergingCells:
     def face_corners(self, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return starts and places of the corners of `faces`."""
         counts = self.count[faces]
-        starts = np.concatenate([[0], np.cumsum(counts)])
+        starts = starts_of(counts)
         places = np.repeat(self.begin[faces] - starts[:-1], counts)
         places += np.arange(len(places))
         return starts, places
@@ -258,7 +258,7 @@ class MergingCells:
         first &= counts[group] > 1
         group, vertices, codes = group[first], vertices[first], codes[first]
         kept = counts > 1
-        starts = np.concatenate([[0], np.cumsum(counts[kept])])
+        starts = starts_of(counts[kept])
         codes = codes - np.repeat(codes[starts[:-1]], np.diff(starts))
         sets = merges.sets[kept]
         made = Merges(starts, vertices, codes, sets, merges.priority, merges.reach)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..mesh.connectivity import distinct, following, take_rows
+from ..connectivity import distinct, following, rows_and_places, rows_of, starts_of, take_rows
 
 if TYPE_CHECKING:
     from .merging import Merges, MergingCells
@@ -43,7 +43,7 @@ class Neighborhood:
         self.k, self.set_of_group = len(merges.priority), merges.sets
         old_starts, places = whole.face_corners(faces)
         corners, codes = whole.corners[places], whole.codes[places]
-        face = np.repeat(np.arange(len(faces)), np.diff(old_starts))
+        face = rows_of(old_starts)
         at = whole.find(VERTICES, merges.vertices, corners)
         moved = np.flatnonzero(at >= 0)
         at, new = at[moved], np.full(len(corners), -1)
@@ -60,7 +60,7 @@ class Neighborhood:
         kept &= self.alive[face]
         counts[~self.alive] = 0
         self._lost = np.diff(old_starts) - counts
-        self.starts = np.concatenate([[0], np.cumsum(counts)])
+        self.starts = starts_of(counts)
         self.corners, self.codes, self.face = corners[kept], codes[kept], face[kept]
         self.new = new[kept]
         self.after = following(self.starts)
@@ -79,9 +79,9 @@ class Neighborhood:
         star = whole.find(FACES, faces, side_face)
         rows = np.flatnonzero(np.where(star < 0, whole.count[side_face] > 0, self.alive[star]))
         self.side_face, self.side_star = side_face[rows], star[rows]
-        self.side_cell = np.repeat(np.arange(len(self.cells)), np.diff(starts))[rows]
+        self.side_cell = rows_of(starts)[rows]
         counts = np.bincount(self.side_cell, minlength=len(self.cells))
-        self.side_starts = np.concatenate([[0], np.cumsum(counts)])
+        self.side_starts = starts_of(counts)
         back = sides[rows] % 2
         self.side_sign = 1.0 - 2 * back
         self.side_code = back * whole.face_codes[self.side_face]
@@ -118,7 +118,7 @@ class Neighborhood:
         corner = np.flatnonzero(self.new >= 0)
         starts = np.searchsorted(self.face[corner], np.arange(len(self.faces) + 1))
         starts, corner = take_rows(starts, corner, self.side_star[self.star])
-        side = self.star[np.repeat(np.arange(len(starts) - 1), np.diff(starts))]
+        side = self.star[rows_of(starts)]
         cell = self.side_cell[side]
         hub = _pack_keys(cell, self.new[corner], self.codes[corner] - self.side_code[side])
         ends = np.concatenate([self.after[corner], self.before[corner]])
@@ -220,7 +220,7 @@ def _pairs(groups: np.ndarray, items: np.ndarray) -> tuple[np.ndarray, np.ndarra
     groups, items = _runs(groups[order]), items[order]
     counts = np.bincount(groups)
     later = np.cumsum(counts)[groups] - np.arange(len(groups)) - 1
-    first = np.repeat(np.arange(len(groups)), later)
-    second = first + 1 + np.arange(len(first)) - np.repeat(np.cumsum(later) - later, later)
+    first, place = rows_and_places(later)
+    second = first + 1 + place
     one, other = items[first], items[second]
     return one[one != other], other[one != other]

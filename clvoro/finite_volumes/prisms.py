@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from ..arguments import check_number, format_point
+from ..connectivity import starts_of, take_rows
 from ..errors import InputError
-from ..mesh.connectivity import take_rows
 from ..mesh.faces import Faces
 
 
@@ -46,7 +46,7 @@ def polyhedra(mesh: Faces, thickness: float | None = None) -> Faces:
         mesh,
         generators=np.pad(mesh.generators, ((0, 0), (0, 1))),
         points=points,
-        starts=np.concatenate([[0], np.cumsum(lengths)]),
+        starts=starts_of(lengths),
         corners=np.concatenate([sides.ravel(), bottoms, loops + v]),
         owner=np.concatenate([mesh.owner, cells, cells]),
         neighbor=np.concatenate([mesh.neighbor, np.repeat(np.array([-1 - walls, -2 - walls], np.int32), n)]),
@@ -80,7 +80,7 @@ def simple_loops(mesh: Faces) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     order = np.argsort(key, kind="stable")
     key, cell, begin, end = key[order], cell[order], begin[order], end[order]
     counts = np.bincount(cell, minlength=mesh.n_cells)
-    starts = np.concatenate([[0], np.cumsum(counts)])
+    starts = starts_of(counts)
     after = np.minimum(np.searchsorted(key, cell * v + end), len(key) - 1)
     loop = begin.copy()
     seen = np.zeros(len(key), bool)

@@ -14,6 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..connectivity import rows_of
 from ..geometry.polygon import Polygon
 from ..mesh.faces import Faces
 from ..mesh.straightening import cross
@@ -352,7 +353,7 @@ class _Edit:
 
     def mesh(self) -> Faces:
         """Return the changed mesh."""
-        cell = np.repeat(np.arange(self.old.n_cells), np.diff(self.starts))
+        cell = rows_of(self.starts)
         kept = ~np.isin(cell, list(self.changed))
         sides = [np.column_stack([cell, self.sides[self.rows]])[kept]]
         sides += [np.array([(c, *side) for side in loop]) for c, loop in self.changed.items()]

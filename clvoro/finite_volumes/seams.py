@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from ..connectivity import rows_and_places, take_rows
 from ..errors import ClvoroError
-from ..mesh.connectivity import take_rows
 from ..mesh.diagram import Diagram
 from ..mesh.faces import Faces
 
@@ -74,12 +74,12 @@ def _aligned(faces: Faces) -> np.ndarray:
     if not len(lower):
         return corners
     counts = np.diff(starts)[lower]
-    face, base = np.repeat(np.arange(len(lower)), counts), np.cumsum(counts) - counts
-    within = np.arange(counts.sum()) - base[face]
+    face, within = rows_and_places(counts)
     places = starts[lower][face] + within
     # The twin's period leads from the lower to the upper side.
     wanted = points[corners[starts[twin[lower]]]] - period[twin[lower]]
     off = ((points[corners[places]] - wanted[face]) ** 2).sum(axis=1)
+    base = np.cumsum(counts) - counts
     nearest = np.lexsort((off, face))[base] - base
     turned = np.array(corners)
     turned[places] = corners[starts[lower][face] + (within + nearest[face]) % counts[face]]

@@ -7,8 +7,8 @@ from functools import cached_property
 
 import numpy as np
 
+from ..connectivity import following, independent, rows_of, starts_of, take_rows
 from ..geometry.rings import WALL_CORNER
-from ..mesh.connectivity import following, independent, take_rows
 from ..mesh.faces import Faces
 from ..mesh.geometry import polygon_areas, smaller_size, turns
 from ..mesh.straightening import cross
@@ -66,7 +66,7 @@ class _Round:
         """Choose among the short faces of `mesh` without those of `failed`."""
         self.mesh, v = mesh, len(mesh.points)
         self.starts, self.loop, broken = simple_loops(mesh)
-        self.cell = np.repeat(np.arange(mesh.n_cells), np.diff(self.starts))
+        self.cell = rows_of(self.starts)
         self.images = mesh.images if any(mesh.domain.periodic) else np.arange(v)
         self.kind = _point_kinds(mesh, parts, self.images)
         ratio = _lengths_over_limits(mesh, broken)
@@ -135,7 +135,7 @@ class _Round:
         every, face, into = np.ones(len(self.faces), bool), self.face_of[corners], self.into[corners]
         kept = into != into[following(before)]
         left = np.bincount(row, kept, len(least)).astype(int)
-        after, into = np.concatenate([[0], np.cumsum(left)]), into[kept]
+        after, into = starts_of(left), into[kept]
         # Beside an island a cell would touch itself if it has both ends of the face, but not the face.
         key = np.sort(row[kept] * len(self.mesh.points) + into)
         bad = left < 3
@@ -148,7 +148,7 @@ class _Round:
         """The cells around the faces as ragged rows of points, the row of each point, and the cells' least turns."""
         touched = np.unique(self.cell[self.face_of[self.loop] >= 0])
         starts, corners = take_rows(self.starts, self.loop, touched)
-        row = np.repeat(np.arange(len(touched)), np.diff(starts))
+        row = rows_of(starts)
         return starts, corners, row, _least_turns(self.mesh.points[corners], starts)
 
     def _moved(self, target: np.ndarray, done: np.ndarray) -> np.ndarray:
@@ -206,7 +206,7 @@ def _least_turns(corners: np.ndarray, starts: np.ndarray) -> np.ndarray:
     turn = turns(corners, following(starts))
     enough = np.diff(starts) >= 3
     least = np.full(len(starts) - 1, -np.pi)
-    rows = np.repeat(np.arange(len(least)), np.diff(starts))
+    rows = rows_of(starts)
     full = np.full(len(least), np.inf)
     np.minimum.at(full, rows, turn)
     least[enough] = full[enough]

@@ -21,9 +21,9 @@ from dataclasses import dataclass
 import numpy as np
 import scipy
 
+from ..connectivity import components, first_nodes, rows_of, starts_of
 from ..geometry.polygon import Polygon
 from ..geometry.rings import WALL_CORNER, OrientedRings
-from ..graphs import components, first_nodes
 from ..mesh.diagram import Diagram
 from ..mesh.faces import Faces
 from ..mesh.straightening import chain_areas, choose_corners, cross
@@ -416,7 +416,7 @@ class _WallMaker:
         chain, path, starts = self._chains(ring, s, t, gap)
         begin = along.begins[along.ring_starts[:-1]][ring]
         total = along.begins[along.ring_starts[1:]][ring] - begin
-        row = np.repeat(np.arange(len(cell)), np.diff(starts))
+        row = rows_of(starts)
         chosen = (path < 0) | self.changes_part[path]
         choose_corners(chain, chosen, self.size[cell][row])
         kept = np.flatnonzero(chosen)
@@ -450,7 +450,7 @@ class _WallMaker:
         first = np.maximum(np.searchsorted(along.begins, s, side="right"), begin)
         last = np.clip(np.searchsorted(along.begins, t, side="left"), begin, end)
         count = np.maximum(last - first + np.where(t < s, end - begin, 0), 0)
-        starts = np.concatenate([[0], np.cumsum(count + 2)])
+        starts = starts_of(count + 2)
         row = np.repeat(np.arange(len(count)), count + 2)
         path = first[row] + np.arange(starts[-1]) - starts[row] - 1
         path = begin[row] + (path - begin[row]) % (end - begin)[row]

@@ -7,6 +7,8 @@ from collections.abc import Callable
 
 import numpy as np
 
+from ..connectivity import rows_of
+
 _LEAF = 4  # items per leaf at most
 _BLOCK = 1 << 9  # points per batch: its pairs with boxes and items stay in the caches
 
@@ -67,7 +69,7 @@ class Tree:
             low = np.minimum.reduceat(inside, starts[:-1])
             extent = np.maximum.reduceat(inside, starts[:-1]) - low
             axis = extent.argmax(axis=1)
-            node = np.repeat(np.arange(1 << level), np.diff(starts))
+            node = rows_of(starts)
             longest = extent[np.arange(len(axis)), axis]
             # One key for the node and the place in it. Items at equal places may go to either child.
             place = inside[np.arange(self.n), axis[node]] - low[node, axis[node]]

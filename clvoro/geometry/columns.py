@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from ..connectivity import rows_and_places
+
 _BLOCK = 1 << 15  # pairs of a point and a triangle per batch
 _MOST = 1 << 20  # columns at most
 
@@ -35,8 +37,7 @@ class Columns:
         self._bounds = low[:, 0], high[:, 0], low[:, 1], high[:, 1], corners[:, :, self.axis].max(axis=1)
         self._sides = [self._side(flat[:, k], flat[:, (k + 1) % 3]) for k in range(3)]
         each = np.where(seen, count.prod(axis=1), 0)
-        item = np.repeat(np.arange(len(corners)), each)
-        place = np.arange(len(item)) - np.repeat(np.cumsum(each) - each, each)
+        item, place = rows_and_places(each)
         row, column = np.divmod(place, count[item, 1])
         key = (first[item, 0] + row) * self.shape[1] + first[item, 1] + column
         order = np.argsort(key, kind="stable")
@@ -83,8 +84,7 @@ class Columns:
         ends = np.cumsum(count)
         for begin, end in _batches(ends):
             mine, n = who[begin:end], count[begin:end]
-            local = np.repeat(np.arange(end - begin), n)
-            place = np.arange(len(local)) - np.repeat(np.cumsum(n) - n, n)
+            local, place = rows_and_places(n)
             item = self.items[np.repeat(self.starts[column[begin:end]], n) + place]
             crossed = self._crossed(points[mine[local]], item)
             wound[mine] += np.bincount(local, crossed, end - begin).astype(np.int64)

@@ -6,6 +6,7 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
+from ..connectivity import ranges
 from ..opencl.engine import Engine
 from ..opencl.workspace import Workspace
 
@@ -80,10 +81,3 @@ def bin_edges(begins: np.ndarray, ends: np.ndarray) -> tuple[np.ndarray, np.ndar
     starts = np.searchsorted(bins[order], np.arange(counts.prod() + 1))
     frame = np.array([*lower, 1 / edge, 0.0])
     return frame, np.array([*counts, 0, 0], np.int32), starts.astype(np.int32), number[entry][order]
-
-
-def ranges(first: np.ndarray, last: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return all pairs (i, k) with first[i] <= k <= last[i]."""
-    lengths = last - first + 1
-    i = np.repeat(np.arange(len(first)), lengths)
-    return i, np.arange(len(i)) - np.repeat(np.cumsum(lengths) - lengths, lengths) + first[i]

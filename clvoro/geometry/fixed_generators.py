@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import scipy
 
+from ..connectivity import rows_and_places
 from .rings import WALL_CORNER, OrientedRings
 
 if TYPE_CHECKING:
@@ -97,8 +98,7 @@ def place_around_corners(
     corners = np.flatnonzero(sharp)
     count = np.maximum(np.rint(angle[corners] / (np.pi / 2)).astype(int), 2)
     sector = angle[corners] / count
-    corner = np.repeat(np.arange(len(corners)), count)
-    place = np.arange(len(corner)) - np.repeat(np.cumsum(count) - count, count)
+    corner, place = rows_and_places(count)
     way = np.arctan2(*rings.along[corners].T[::-1])[corner] + sector[corner] * (place + 0.5)
     size_at = h[corners][corner]
     reach = size_at / (2 * np.sin(sector / 2))[corner]

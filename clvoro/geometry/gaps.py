@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import scipy
 
+from ..connectivity import rows_and_places
+
 if TYPE_CHECKING:
     from .polygon import Polygon
 
@@ -50,8 +52,8 @@ def find_gaps(domain: Polygon, least: float, most: float) -> tuple[np.ndarray, n
     counts = np.clip(np.ceil(length / (most / 2)), 1, _MAX_SAMPLES).astype(np.int64)
     rows = np.arange(len(counts))
     while rows.size:
-        row = np.repeat(rows, counts[rows])
-        t = np.arange(len(row)) - np.repeat(np.cumsum(counts[rows]) - counts[rows], counts[rows])
+        row, t = rows_and_places(counts[rows])
+        row = rows[row]
         points = start[row] + ((t + 0.5) / counts[row])[:, None] * edge[row]
         begin, end, radius = _balls(domain, points, normal[row], most)
         narrowest = np.full(len(counts), math.inf)
@@ -132,8 +134,8 @@ def _wall_samples(
     start, edge, length = domain.oriented.vertices, domain.oriented.along, domain.oriented.lengths
     # Long edges in parts, along which the size changes.
     parts = np.ceil(length / (domain.extent.max() / _PARTS)).astype(np.int64)
-    row = np.repeat(np.arange(len(edge)), parts)
-    first = (np.arange(len(row)) - np.repeat(np.cumsum(parts) - parts, parts)) / parts[row]
+    row, first = rows_and_places(parts)
+    first = first / parts[row]
     share = first + 0.5 / parts[row]
     counts = 2 * length[row] / parts[row] / size(start[row] + share[:, None] * edge[row])
     reached = np.concatenate([[0.0], np.cumsum(counts)])
@@ -153,9 +155,9 @@ def _from_corners(domain: Polygon, normal: np.ndarray, most: float) -> tuple[np.
     turn = np.arctan2(first[:, 0] * normal[:, 1] - first[:, 1] * normal[:, 0], (first * normal).sum(axis=1))
     rows = np.flatnonzero(turn < -_FAN)
     counts = np.ceil(-turn[rows] / _FAN).astype(np.int64) - 1
-    row = np.repeat(rows, counts)
-    step = np.arange(len(row)) - np.repeat(np.cumsum(counts) - counts, counts) + 1
-    angle = np.arctan2(first[row, 1], first[row, 0]) + turn[row] * step / np.repeat(counts + 1, counts)
+    fan, step = rows_and_places(counts)
+    row = rows[fan]
+    angle = np.arctan2(first[row, 1], first[row, 0]) + turn[row] * (step + 1) / (counts + 1)[fan]
     direction = np.column_stack([np.cos(angle), np.sin(angle)])
     begin, end, radius = _balls(domain, domain.oriented.vertices[row], direction, most)
     return begin[np.isfinite(radius)], end[np.isfinite(radius)]

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..connectivity import rows_and_places
 from .curves import angles
 from .polygon import Polygon
 
@@ -274,8 +275,7 @@ def _places(lengths: np.ndarray, width: float, joined: bool, chain: Chain) -> np
     after = np.concatenate([meet, [half[-1] if ends is None else ends]]) * (1 + fans[1])
     steps = (runs - before - after) / np.maximum(counts - 1, 1)
     n = counts.astype(np.int64)
-    run = np.repeat(np.arange(len(runs)), n)
-    number = np.arange(n.sum()) - np.repeat(np.cumsum(n) - n, n)
+    run, number = rows_and_places(n)
     return starts[run] + before[run] + number * steps[run]
 
 

@@ -16,6 +16,7 @@ import numpy as np
 import shapely
 
 from ..arguments import check_rows, format_point, warn
+from ..connectivity import rows_and_places
 from ..errors import InputError, InputTypeError, MismatchWarning
 from ..opencl.engine import Engine, Traits
 from .boundary_names import BoundaryNames, Walls
@@ -654,8 +655,7 @@ class Polygon(Domain):
         """Return the integral of `function` of places (k, 2) along the boundary, from about `samples` places."""
         edges = self.oriented
         parts = np.maximum(1, np.ceil(samples * edges.lengths / edges.lengths.sum())).astype(int)
-        edge = np.repeat(np.arange(len(parts)), parts)
-        part = np.arange(len(edge)) - np.repeat(np.cumsum(parts) - parts, parts)
+        edge, part = rows_and_places(parts)
         places = edges.vertices[edge] + ((part + 0.5) / parts[edge])[:, None] * edges.along[edge]
         return float((edges.lengths[edge] / parts[edge] * function(places)).sum())
 

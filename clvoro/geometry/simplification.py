@@ -18,8 +18,8 @@ import scipy
 import shapely
 
 from ..arguments import check_number, format_point
+from ..connectivity import components
 from ..errors import InputError, InputTypeError
-from ..graphs import components
 
 if TYPE_CHECKING:
     from .polygon import Polygon

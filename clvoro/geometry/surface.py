@@ -12,8 +12,8 @@ import numpy as np
 import scipy
 
 from ..arguments import format_point
+from ..connectivity import components
 from ..errors import InputError, InputTypeError
-from ..graphs import components
 from .bvh import Tree
 from .columns import Columns
 from .shapes import coordinates

@@ -9,10 +9,10 @@ from weakref import WeakKeyDictionary
 import numpy as np
 import scipy
 
+from ..connectivity import ranges
 from ..opencl.engine import Engine
 from ..opencl.workspace import Workspace
 from .bvh import Tree, curve_order
-from .edge_bins import ranges
 
 SMOOTH, CONVEX, CONCAVE = 0, 1, 2
 """Kinds of edges and corners of triangles: within a patch, on a convex crease, on a concave one."""

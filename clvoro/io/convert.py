@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ..connectivity import starts_of
 from ..errors import ClvoroError, InputError, MissingLibraryError
 from ..geometry.domain import Domain, images_in
 from ..mesh.results import Result
@@ -245,7 +246,7 @@ def write_metis(contents: Contents, path: Path) -> None:
     i, j = (ends[: faces.n_inner].astype(np.int64) for ends in (faces.owner, faces.neighbor))
     pairs = np.unique(np.concatenate([i * n + j, j * n + i]))
     pairs = pairs[pairs // n != pairs % n]
-    starts = np.concatenate([[0], np.cumsum(np.bincount(pairs // n, minlength=n))])
+    starts = starts_of(np.bincount(pairs // n, minlength=n))
     neighbors = pairs % n + 1
     with atomic_file(path) as file:
         file.write(f"{n} {len(pairs) // 2}\n".encode())

@@ -7,13 +7,12 @@ from typing import Any
 
 import numpy as np
 
+from ..connectivity import first_nodes, take_rows
 from ..errors import InputError
 from ..finite_volumes.criteria import Criterion, Rows, SolverReport
 from ..finite_volumes.gate import LEAST_MEASURE, SOLVERS, around_islands, regions
 from ..finite_volumes.prisms import cell_loops
 from ..finite_volumes.solver_mesh import WallShape
-from ..graphs import first_nodes
-from ..mesh.connectivity import take_rows
 from ..mesh.diagram import Diagram
 from ..mesh.faces import Faces
 from ..mesh.geometry import smaller_size

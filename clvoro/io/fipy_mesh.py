@@ -9,10 +9,10 @@ from fipy.meshes.mesh import Mesh
 from fipy.meshes.mesh2D import Mesh2D
 from fipy.variables.faceVariable import FaceVariable
 
+from ..connectivity import rows_of, take_rows
 from ..errors import InputError
 from ..finite_volumes.prisms import cell_loops
 from ..finite_volumes.solver_mesh import WallShape
-from ..mesh.connectivity import take_rows
 from ..mesh.diagram import Diagram
 from ..mesh.faces import Faces
 
@@ -137,7 +137,7 @@ def _cell_faces(mesh: Faces) -> tuple[np.ndarray, np.ndarray]:
     key = cell * len(mesh.points) + mesh.side_ends()[0]
     order = np.argsort(key)
     starts, loops = cell_loops(mesh)
-    wanted = np.repeat(np.arange(mesh.n_cells), np.diff(starts)) * len(mesh.points) + loops
+    wanted = rows_of(starts) * len(mesh.points) + loops
     return starts, face[order[np.searchsorted(key[order], wanted)]]
 
 

@@ -26,12 +26,12 @@ import orjson
 from numpy.typing import ArrayLike
 
 from ..arguments import check_flag
+from ..connectivity import slices
 from ..errors import InputError, InputTypeError
 from ..finite_volumes.gate import rejection
 from ..finite_volumes.prisms import polyhedra
 from ..finite_volumes.solver_mesh import WallShape, make_solver_mesh
 from ..geometry.boundary_names import WORD, Walls
-from ..mesh.connectivity import slices
 from ..mesh.diagram import Diagram
 from ..mesh.faces import Faces
 from .atomic import atomic_file, atomic_folder, make_folder

@@ -14,8 +14,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ..connectivity import distinct, take_rows, used_indices
 from ..errors import InputError, InputTypeError
-from ..mesh.connectivity import distinct, take_rows, used_indices
 from ..mesh.faces import Faces
 
 ADDRESSING = ("cellProcAddressing", "faceProcAddressing", "pointProcAddressing", "boundaryProcAddressing")

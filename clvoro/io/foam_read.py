@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ..connectivity import following, starts_of, take_rows
 from ..errors import InputError
 from ..files import open_plain
 from ..finite_volumes.criteria import SolverReport
@@ -19,7 +20,6 @@ from ..finite_volumes.gate import openfoam_report
 from ..finite_volumes.measures import SolverMeasures
 from ..geometry.box import Box
 from ..geometry.domain import Domain
-from ..mesh.connectivity import following, take_rows
 from ..mesh.diagram import Diagram
 from ..mesh.faces import Faces
 from .arrays import FileError, explained
@@ -247,7 +247,7 @@ class FoamFile:
         begin = _LIST.match(self.body)
         body = self.body[0 if begin is None else begin.end() :]
         counts = np.array(re.findall(rb"(\d+)\s*\(", body), int)
-        starts = np.concatenate([[0], np.cumsum(counts)])
+        starts = starts_of(counts)
         text = body.replace(b"(", b" ").replace(b")", b" ").split()
         numbers = np.array(text, np.int64)
         if begin is None or len(counts) != int(begin[1]) or len(numbers) != starts[-1] + len(counts):

@@ -19,10 +19,10 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 
 from ..arguments import check_choice
+from ..connectivity import rows_of, take_rows
 from ..finite_volumes.prisms import cell_loops
 from ..finite_volumes.solver_mesh import WallShape, make_solver_mesh
 from ..geometry.domain import Domain
-from ..mesh.connectivity import take_rows
 from ..mesh.diagram import Diagram
 from ..mesh.faces import Faces
 from ..mesh.straightening import count_sides
@@ -153,7 +153,7 @@ def _bridges(diagram: Diagram) -> np.ndarray:
     Corners alone do not distinguish a bridge from a slit without width in single precision.
     """
     starts, following = diagram.neighbor_starts, diagram.half_faces.next
-    cell = np.repeat(np.arange(len(diagram)), np.diff(starts))
+    cell = rows_of(starts)
     ends = following != np.arange(1, len(following) + 1)
     loop = np.concatenate([[0], np.cumsum(ends)[:-1]])
     earlier = loop - loop[starts[:-1]][cell]
@@ -178,7 +178,7 @@ def _half_faces(mesh: Diagram | Faces) -> tuple[np.ndarray, np.ndarray, np.ndarr
         return mesh.half_faces.owner, *mesh.half_faces.corners
     starts, sides = mesh.cell_faces()
     face = mesh.sides()[1][sides]
-    cell = np.repeat(np.arange(mesh.n_cells), np.diff(starts))
+    cell = rows_of(starts)
     return cell, *take_rows(mesh.starts, mesh.corners, face, sides >= len(mesh))
 
 

@@ -24,10 +24,10 @@ from xml.sax.saxutils import unescape
 
 import numpy as np
 
+from ..connectivity import following, rows_of, starts_of
 from ..files import open_plain
 from ..geometry.domain import Domain
 from ..mesh.check.rebuilt import rebuild, rebuild_on_sphere
-from ..mesh.connectivity import following
 from ..mesh.diagram import Diagram
 from ..mesh.results import Result, result_of_file
 from ..mesh.straightening import cell_quality
@@ -290,8 +290,8 @@ def _cell_polygons(arrays: Mapping[str, np.ndarray], v: int, domain: Domain) -> 
         kept = np.ones(len(corners), bool)
         kept[_indices(arrays["FieldData.bridges"], len(corners), "bridges")] = False
         ends = np.stack([corners, corners[following(starts)]], axis=1)[kept]
-        counts = np.bincount(np.repeat(np.arange(len(starts) - 1), np.diff(starts))[kept], minlength=len(starts) - 1)
-        found["neighbor_starts"] = np.concatenate([[0], np.cumsum(counts)])
+        counts = np.bincount(rows_of(starts)[kept], minlength=len(starts) - 1)
+        found["neighbor_starts"] = starts_of(counts)
         found |= {"face_vertex_starts": 2 * np.arange(len(ends) + 1), "face_vertices": ends.ravel()}
     return found
 
@@ -344,7 +344,7 @@ def _cell_polyhedra(arrays: Mapping[str, np.ndarray], v: int, domain: Domain) ->
             raise FileError("faces differ from the counts of their cells")
         cells.append(len(counts))
     headers = np.array(counts, np.int64)
-    faces = np.concatenate([[0], np.cumsum(stream[headers])])
+    faces = starts_of(stream[headers])
     corners = np.delete(stream, np.concatenate([ends[:-1], headers]))
     return {
         "neighbor_starts": np.array(cells, np.int64),

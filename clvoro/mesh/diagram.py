@@ -178,7 +178,7 @@ class Diagram(MeshOutput):
             return np.zeros(len(self.points), np.int16)
         if name == "face_vertex_starts":
             return 2 * np.arange(len(self.cell_vertices) + 1, dtype=np.int32)
-        from .connectivity import following
+        from ..connectivity import following
 
         corners = self.cell_vertices
         return np.stack([corners, corners[following(self.cell_vertex_starts)]], axis=1).ravel()

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..graphs import components
-from .connectivity import following, inverse, slices, take_rows
+from ..connectivity import components, following, inverse, slices, starts_of, take_rows
 from .geometry import face_vectors, polygon_areas
 from .read_only import Sealed, read_only
 
@@ -284,7 +283,7 @@ class Faces(Sealed):
     def cell_faces(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the sides (see `sides`) of each cell as ragged rows: starts (n + 1,) and places among the sides."""
         cells, _ = self.sides()
-        starts = np.concatenate([[0], np.cumsum(np.bincount(cells, minlength=self.n_cells))])
+        starts = starts_of(np.bincount(cells, minlength=self.n_cells))
         return starts, np.argsort(cells, kind="stable")
 
     def with_half_faces(self, half_face: np.ndarray) -> Faces:

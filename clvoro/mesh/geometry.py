@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from .connectivity import following
+from ..connectivity import following
 from .read_only import Sealed
 from .straightening import cross
 

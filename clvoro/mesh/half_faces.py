@@ -7,8 +7,8 @@ from functools import cached_property
 
 import numpy as np
 
+from ..connectivity import following, rows_of, starts_of
 from ..errors import ClvoroError
-from .connectivity import following
 from .diagram import Diagram
 from .read_only import read_only
 
@@ -79,11 +79,11 @@ class HalfFaceArrays:
         kept[last] = corners[last] != corners[starts[filled]]
         if kept.all() and (np.diff(starts) >= least).all():
             return starts, corners
-        rows = np.repeat(np.arange(len(starts) - 1), np.diff(starts))
+        rows = rows_of(starts)
         counts = np.bincount(rows[kept], minlength=len(starts) - 1)
         counts[counts < least] = 0
         kept &= counts[rows] > 0
-        return read_only(np.concatenate([[0], np.cumsum(counts)])), read_only(corners[kept])
+        return read_only(starts_of(counts)), read_only(corners[kept])
 
     @cached_property
     def cell_corners(self) -> tuple[np.ndarray, np.ndarray]:
@@ -92,10 +92,10 @@ class HalfFaceArrays:
         A repeated corner is given once. Several loops are joined by bridges, as in the diagram.
         """
         starts, corners = self.diagram.cell_vertex_starts, self.diagram.cell_vertices
-        cell = np.repeat(np.arange(len(self.diagram)), np.diff(starts))
+        cell = rows_of(starts)
         kept = corners != corners[following(starts)]
         counts = np.bincount(cell[kept], minlength=len(self.diagram))
-        return read_only(np.concatenate([[0], np.cumsum(counts)])), read_only(corners[kept])
+        return read_only(starts_of(counts)), read_only(corners[kept])
 
     def behind(self, faces: np.ndarray) -> np.ndarray:
         """Return the generators, or their images, behind the half-faces `faces` (k,): (k, d).
@@ -139,7 +139,7 @@ class HalfFaceArrays:
     def bent_cells(self) -> np.ndarray:
         """Whether each cell in 3D has a face with corners off its bisector or wall, (n,) bool."""
         d = self.diagram
-        face = np.repeat(np.arange(len(d.neighbors)), np.diff(d.face_vertex_starts))
+        face = rows_of(d.face_vertex_starts)
         owner, (normals, gaps) = self.owner[face], self.planes(np.arange(len(d.neighbors)))
         heights = ((d.vertices[d.face_vertices] - d.points[owner]) * normals[face]).sum(axis=1)
         off = np.abs(heights - gaps[face]) > FLAT * np.cbrt(d.volumes[owner])
@@ -198,7 +198,7 @@ class HalfFaceArrays:
         edge[first] = np.arange(len(first))
         edge[~lower] = edge[twin[~lower]]
         cell = self.owner[rows]
-        starts = np.concatenate([[0], np.cumsum(np.bincount(cell, minlength=len(d)))])
+        starts = starts_of(np.bincount(cell, minlength=len(d)))
         begin, end = ends[rows].T
         return HalfEdges(rows, cell, starts, begin, end, onward, previous, twin, edge, first)
 

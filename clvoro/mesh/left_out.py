@@ -9,8 +9,8 @@ import scipy
 import shapely
 
 from ..arguments import format_point
+from ..connectivity import following, rows_of, take_rows
 from ..geometry.polygon import Polygon
-from .connectivity import following, take_rows
 from .faces import Faces
 from .geometry import polygon_areas
 from .read_only import Sealed
@@ -64,7 +64,7 @@ def left_out_at_walls(mesh: Faces) -> LeftOut:
     def triangles() -> tuple[np.ndarray, np.ndarray]:
         walls = np.arange(mesh.n_inner, mesh.n_outer)
         starts, corners = take_rows(mesh.starts, mesh.corners, walls)
-        face, after = np.repeat(np.arange(len(walls)), np.diff(starts)), following(starts)
+        face, after = rows_of(starts), following(starts)
         ends = mesh.points[corners], mesh.points[corners[after]], mesh.center[walls][face]
         return np.stack(ends, axis=1), np.cbrt(mesh.volumes[mesh.owner[walls]])[face]
 

@@ -10,8 +10,8 @@ import scipy
 import shapely
 
 from ..arguments import check_integer
+from ..connectivity import rows_and_places, rows_of, starts_of, take_rows
 from ..errors import InputError
-from .connectivity import take_rows
 from .diagram import Diagram
 from .read_only import Sealed
 
@@ -143,7 +143,7 @@ class Locator:
         moving, best, least = np.arange(len(x)), cells.copy(), np.full(len(x), np.inf)
         for _ in range(_STEPS):
             begin, side = take_rows(starts, places, cells[moving])
-            row, back = np.repeat(np.arange(len(moving)), np.diff(begin)), side >= len(f)
+            row, back = rows_of(begin), side >= len(f)
             k = face[side]
             beyond = ((x[moving][row] - f.center[k]) * f.normal[k]).sum(axis=1) * np.where(back, -1, 1)
             behind = np.where(back, f.owner[k], f.neighbor[k])
@@ -179,7 +179,7 @@ def dual_triangles(diagram: Diagram) -> np.ndarray:
             "neighbors and shifts, which every diagram has"
         )
     n, starts = len(diagram), diagram.cell_vertex_starts
-    cells = np.repeat(np.arange(n, dtype=np.int64), np.diff(starts))
+    cells = rows_of(starts)
     # A cell with several loops lists the ends of its bridges twice.
     pairs = np.unique(diagram.cell_vertices * np.int64(n) + cells)
     vertices, cells = pairs // n, pairs % n
@@ -199,8 +199,8 @@ def dual_triangles(diagram: Diagram) -> np.ndarray:
     counts = np.diff(first, append=len(vertices))
     # A fan of counts - 2 triangles; one triangle at most vertices.
     fans = np.maximum(counts - 2, 0)
-    apex = np.repeat(first, fans)
-    step = 1 + np.arange(len(apex)) - np.repeat(np.cumsum(fans) - fans, fans)
+    row, place = rows_and_places(fans)
+    apex, step = first[row], place + 1
     return np.column_stack([cells[apex], cells[apex + step], cells[apex + step + 1]]).astype(np.int32)
 
 
@@ -213,7 +213,7 @@ def cell_shapes(diagram: Diagram, chosen: np.ndarray | None = None) -> np.ndarra
     loop = np.cumsum(begins) - 1
     sizes = np.bincount(loop)
     ring = np.repeat(np.arange(len(sizes)), sizes + 1)
-    starts = np.concatenate([[0], np.cumsum(sizes)])
+    starts = starts_of(sizes)
     # The first corner comes again at the end.
     place = np.arange(len(ring)) - ring
     place = np.where(place == starts[ring + 1], starts[ring], place)

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..connectivity import ranges, rows_of, starts_of
 from ..geometry.polygon import Polygon
 from ..geometry.rings import WALL_CORNER
 from .diagram import Diagram
@@ -121,9 +122,7 @@ def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 def chain_areas(points: np.ndarray, first: np.ndarray, last: np.ndarray) -> np.ndarray:
     """Return the area within the `points` (k, 2) from each `first` to each `last` (g,), negative if clockwise."""
-    starts = np.concatenate([[0], np.cumsum(last - first)])
-    row = np.repeat(np.arange(len(first)), last - first)
-    place = first[row] + np.arange(starts[-1]) - starts[row]
+    row, place = ranges(first, last - 1)
     base = points[first][row]
     return np.bincount(row, cross(points[place] - base, points[place + 1] - base), len(first)) / 2
 
@@ -142,9 +141,8 @@ def choose_corners(chain: np.ndarray, chosen: np.ndarray, size: np.ndarray) -> N
     low, high = ends[:-1], ends[1:]
     low, high = low[high - low > 1], high[high - low > 1]
     while low.size:
-        starts = np.concatenate([[0], np.cumsum(high - low - 1)])
-        row = np.repeat(np.arange(len(low)), np.diff(starts))
-        place = low[row] + 1 + np.arange(starts[-1]) - starts[row]
+        starts = starts_of(high - low - 1)
+        row, place = ranges(low + 1, high - 1)
         side = chain[high] - chain[low]
         length = np.hypot(*side.T)
         off = cross(chain[place] - chain[low][row], side[row]) / np.maximum(length, 1e-300)[row]
@@ -188,7 +186,7 @@ def _straight_sides(diagram: Diagram, domain: Polygon, owner: np.ndarray) -> _Si
                 break
     # Each run has one point more than faces.
     face, starts = np.array(faces, int), np.array([*firsts, len(faces)], int)
-    run = np.repeat(np.arange(len(begins)), np.diff(starts))
+    run = rows_of(starts)
     run_of_point = np.repeat(np.arange(len(begins)), np.diff(starts) + 1)
     first = np.flatnonzero(np.diff(run_of_point, prepend=-1))
     last = np.append(first[1:], len(run_of_point)) - 1

@@ -9,12 +9,12 @@ from typing import Any, TypeVar, cast
 import numpy as np
 
 from ..arguments import format_point, warn
+from ..connectivity import starts_of, take_rows, used_indices
 from ..errors import InputError, InputTypeError, MismatchWarning
 from ..geometry.domain import Domain
 from ..geometry.sphere import COAST, Sphere, SphereRegion
 from ..geometry.subdomain import Subdomain
 from ..geometry.surface import Surface
-from .connectivity import take_rows, used_indices
 from .diagram import Diagram
 from .results import HISTORY_DTYPE, Result, figures
 
@@ -143,7 +143,7 @@ def _arrays(d: Diagram, kept: np.ndarray, faces: np.ndarray, neighbors: np.ndarr
     arrays = {name: getattr(d, name)[kept] for name in ("points", "volumes", "centroids")}
     arrays |= {"layer": d.layer[kept]} if d.layer.any() else {}
     arrays |= {name: getattr(d, name)[faces] for name in ("face_measures", "face_centroids")}
-    arrays["neighbor_starts"] = np.concatenate([[0], np.cumsum(np.diff(d.neighbor_starts)[kept])]).astype(np.int32)
+    arrays["neighbor_starts"] = starts_of(np.diff(d.neighbor_starts)[kept], np.int32)
     arrays["neighbors"] = neighbors.astype(np.int32)
     rows = {"cell_vertex": np.flatnonzero(kept), "face_vertex": faces}
     corners = {}

@@ -16,9 +16,9 @@ from matplotlib.path import Path
 from numpy.typing import ArrayLike
 
 from ..arguments import format_point
+from ..connectivity import following, starts_of
 from ..errors import InputError
 from ..geometry.domain import Domain, images_in
-from ..mesh.connectivity import following
 from ..mesh.diagram import Diagram
 from ..mesh.results import Result
 from .colors import COLORINGS, Color, Paint, paint_of, picture_of
@@ -271,7 +271,7 @@ def edge_widths(ax: Any, polygons: Sequence[np.ndarray]) -> np.ndarray:
     """Return widths (n,) in points of the outlines of polygons: a part of their own width, 4 area / circumference."""
     if not len(polygons):
         return np.zeros(0)
-    starts = np.concatenate([[0], np.cumsum([len(p) for p in polygons])])
+    starts = starts_of([len(p) for p in polygons])
     corners = np.concatenate(polygons)
     corners = corners - np.repeat(corners[starts[:-1]], np.diff(starts), axis=0)
     (x, y), (u, v) = corners.T, corners[following(starts)].T

@@ -9,10 +9,10 @@ from matplotlib.path import Path
 from numpy.typing import ArrayLike
 
 from ..arguments import check_number
+from ..connectivity import following
 from ..errors import InputError
 from ..geometry.sphere import directions
 from ..io.convert import missing
-from ..mesh.connectivity import following
 from ..mesh.diagram import Diagram
 from ..mesh.results import Result
 from .cells import draw_cells

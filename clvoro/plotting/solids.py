@@ -19,10 +19,10 @@ from matplotlib.patches import Patch
 from numpy.typing import ArrayLike
 
 from ..arguments import format_point
+from ..connectivity import following, starts_of, take_rows
 from ..errors import InputError
 from ..geometry.domain import Domain, images_in
 from ..io.convert import cut_at_sides, missing
-from ..mesh.connectivity import following, take_rows
 from ..mesh.diagram import Diagram
 from ..mesh.faces import Faces
 from ..mesh.results import Result
@@ -353,8 +353,8 @@ def _polyhedra(diagram: Diagram, chosen: Callable[[np.ndarray, np.ndarray], np.n
         first, half_faces = take_rows(diagram.neighbor_starts, np.arange(len(faces[0]) - 1), rows)
         starts, corners = take_rows(*faces, half_faces)
         shown = np.diff(starts) > 0
-        counts = np.diff(np.concatenate([[0], np.cumsum(shown)])[first])
-        ends = np.concatenate([[0], np.cumsum(np.diff(starts) + shown)])[first]
+        counts = np.diff(starts_of(shown)[first])
+        ends = starts_of(np.diff(starts) + shown)[first]
         stream = np.insert(corners.astype(np.int64), starts[:-1][shown], np.diff(starts)[shown])
         heads = np.column_stack([np.diff(ends) + 1, counts]).ravel()
         cells = np.insert(stream, np.repeat(ends[:-1], 2), heads)
@@ -408,7 +408,7 @@ def visible_faces(
     if not surface.n_cells:
         return np.zeros(0, int), [], np.zeros((0, 3))
     polygons = _polygons(surface)
-    starts = np.concatenate([[0], np.cumsum([len(p) for p in polygons])])
+    starts = starts_of([len(p) for p in polygons])
     arms = np.concatenate([p - p[0] for p in polygons])
     normals = np.add.reduceat(np.cross(arms, arms[following(starts)]), starts[:-1], axis=0)
     normals /= np.maximum(np.linalg.norm(normals, axis=1), 1e-300)[:, None]

@@ -9,9 +9,9 @@ import numpy as np
 import pyopencl.array as cla
 import shapely
 
+from ..connectivity import following, rows_of, take_rows
 from ..errors import ClvoroError, InputError
 from ..geometry.bvh import Tree, curve_order
-from ..mesh.connectivity import following, take_rows
 from ..mesh.diagram import Diagram
 from ..mesh.geometry import sum_rows
 from ..mesh.half_faces import FLAT
@@ -73,7 +73,7 @@ def _between_corners(diagram: Diagram) -> Pieces:
     usable = np.diff(starts) >= 3
     if not diagram.domain.cuts_cells:
         return Pieces(cells[usable], inside[usable], x, *take_rows(starts, items, cells[usable]))
-    owner = np.repeat(np.arange(n), np.diff(starts))
+    owner = rows_of(starts)
     after = following(starts)
     edges = x[items[after]] - x[items]
     along = edges[after]
@@ -142,7 +142,7 @@ def _pyramids(diagram: Diagram, faces: np.ndarray) -> Pieces:
     Over other faces they are tetrahedra, with the centroid of the face as a corner, as volumes of cells are defined.
     """
     starts, items = take_rows(diagram.face_vertex_starts, diagram.face_vertices, faces)
-    face, after = np.repeat(np.arange(len(faces)), np.diff(starts)), following(starts)
+    face, after = rows_of(starts), following(starts)
     owner = diagram.half_faces.owner[faces]
     apex, middle, width = diagram.centroids[owner], diagram.face_centroids[faces], np.cbrt(diagram.volumes[owner])
     corners = diagram.vertices[items]

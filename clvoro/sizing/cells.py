@@ -10,6 +10,7 @@ import numpy as np
 import scipy
 
 from ..arguments import check_cell_values
+from ..connectivity import rows_of
 from ..errors import InputError
 from .arguments import coverage_warnings
 from .derivatives import CellStencils, derivatives
@@ -49,7 +50,7 @@ class _Tree(NamedTuple):
             x = points[order]
             spans = np.maximum.reduceat(x, starts[:-1]) - np.minimum.reduceat(x, starts[:-1])
             axis = spans.argmax(axis=1)
-            node = np.repeat(np.arange(2**level), np.diff(starts))
+            node = rows_of(starts)
             along = x[np.arange(n), axis[node]]
             sort = np.lexsort((along, node))
             order, along = order[sort], along[sort]

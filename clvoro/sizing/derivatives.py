@@ -10,6 +10,7 @@ import scipy
 from numpy.typing import ArrayLike
 
 from ..arguments import check_cell_values
+from ..connectivity import rows_of, starts_of
 from ..errors import InputTypeError
 from ..mesh.diagram import Diagram
 from ..mesh.results import Result
@@ -54,7 +55,7 @@ class CellStencils:
         own, other = row[inner], mesh.neighbors[inner]
         # The image of a neighbor's generator is beside this cell, and so is the image of its centroid.
         across = mesh.centroids[other] + mesh.shifts[inner] * mesh.domain.extent - mesh.centroids[own]
-        starts = np.concatenate([[0], np.cumsum(np.bincount(own, minlength=n))])
+        starts = starts_of(np.bincount(own, minlength=n))
         walls = np.bincount(row[~inner], minlength=n) > 0
         return cls(mesh, starts.astype(np.int32), other.astype(np.int32), across, walls)
 
@@ -64,7 +65,7 @@ class CellStencils:
     @cached_property
     def owners(self) -> np.ndarray:
         """The cell of each entry of `neighbors`, (m,)."""
-        return np.repeat(np.arange(len(self)), np.diff(self.starts))
+        return rows_of(self.starts)
 
     @cached_property
     def lengths(self) -> np.ndarray:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import shapely
 
+from ..connectivity import rows_and_places
 from ..errors import InputError, InputTypeError
 from ..geometry import curves
 from ..geometry.bvh import Tree
@@ -141,8 +142,8 @@ class Distance(Field):
         counts = np.maximum(counts, {2: 0.0, 3: 4 * np.pi * (radius / spacing) ** 2}[self._begin.shape[1]])
         counts *= min(1.0, _LANDMARKS / counts.sum())
         counts = np.ceil(counts).astype(int)
-        item = np.repeat(np.arange(len(counts)), counts)
-        t = (np.arange(len(item)) - np.repeat(np.cumsum(counts) - counts, counts)) / counts[item]
+        item, t = rows_and_places(counts)
+        t = t / counts[item]
         points = self._begin[item] + t[:, None] * (self._end - self._begin)[item]
         offset = {2: _on_circles, 3: _on_spheres}[self._begin.shape[1]](t, counts[item])
         return np.concatenate([points + radius[item, None] * offset, self._end])

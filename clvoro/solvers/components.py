@@ -6,8 +6,8 @@ import numpy as np
 import pyopencl.array as cla
 import scipy
 
+from ..connectivity import components
 from ..geometry.domain import Domain
-from ..graphs import components
 from ..opencl.engine import Engine
 from ..tessellation.device_diagram import Tessellation
 

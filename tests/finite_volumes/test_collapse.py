@@ -7,12 +7,12 @@ import pytest
 from scipy.spatial import KDTree
 
 import clvoro
+from clvoro.connectivity import following, take_rows
 from clvoro.finite_volumes import collapse
 from clvoro.finite_volumes.collapse import collapse_short
 from clvoro.finite_volumes.defects import DefectLimits
 from clvoro.finite_volumes.merging import Merges
 from clvoro.finite_volumes.seams import pack, unpack
-from clvoro.mesh.connectivity import following, take_rows
 from tests.reference import polyhedra
 from tests.reference.solids import solid_diagram
 

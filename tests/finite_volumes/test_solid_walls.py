@@ -11,6 +11,7 @@ import scipy
 from scipy.spatial import ConvexHull
 
 import clvoro
+from clvoro.connectivity import following
 from clvoro.errors import InputError
 from clvoro.finite_volumes.solid_walls import balance, mend
 from clvoro.finite_volumes.solid_walls.cures import Cures
@@ -18,7 +19,6 @@ from clvoro.finite_volumes.solid_walls.editing import judge
 from clvoro.finite_volumes.solid_walls.mesh import _Maker, diagram_of, off_middle, outer_generators, solid_diagram
 from clvoro.finite_volumes.solid_walls.near_walls import NearWalls
 from clvoro.finite_volumes.solid_walls.wall_surface import WallSurface
-from clvoro.mesh.connectivity import following
 
 H = 0.25
 

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 from clvoro import io
+from clvoro.connectivity import take_rows
 from clvoro.errors import InputError
 from clvoro.io.contents import describe
 from clvoro.io.vtu import largest_boundary, polyhedra
-from clvoro.mesh.connectivity import take_rows
 from clvoro.mesh.diagram import Diagram
 from tests.io.test_io import assert_equal_results, assert_same_array, rewrite
 from tests.reference import solids

@@ -14,6 +14,7 @@ import pyopencl.array as cla
 import scipy
 
 from ...arguments import warn
+from ...connectivity import starts_of
 from ...errors import TangledMeshWarning
 from ...geometry.domain import Domain
 from ...opencl.engine import Engine
@@ -76,7 +77,7 @@ def connect(engine: Engine, domain: Domain, points: np.ndarray) -> Connections:
     entries = np.concatenate([np.roll(simplices, -k, axis=1) for k in range(d + 1)])
     entries = entries[entries[:, 0] < n]
     entries = entries[np.argsort(entries[:, 0], kind="stable")]
-    starts = np.concatenate([[0], np.cumsum(np.bincount(entries[:, 0], minlength=n))])
+    starts = starts_of(np.bincount(entries[:, 0], minlength=n))
     return Connections(
         engine.upload(starts, np.int32),
         engine.upload(entries[:, 1:], np.int32),

@@ -17,6 +17,7 @@ import numpy as np
 import scipy
 
 from ...arguments import warn
+from ...connectivity import rows_and_places
 from ...errors import TangledMeshWarning
 from ...geometry.domain import Domain
 from ...solvers.linear_system import Solution
@@ -55,9 +56,9 @@ class LatticeMap:
         images = mirrored(points, self.lower, self.upper, REACH * spacing)
         lists = scipy.spatial.KDTree(points).query_ball_tree(scipy.spatial.KDTree(images.points), REACH * spacing)
         counts = np.array([len(found) for found in lists])
-        rows, near = np.repeat(np.arange(n), counts), np.concatenate(lists).astype(int)
+        near = np.concatenate(lists).astype(int)
         # Each point is in its own list. Its entry is zero.
-        places = np.arange(len(rows)) - np.repeat(np.cumsum(counts) - counts, counts)
+        rows, places = rows_and_places(counts)
         away = (images.points[near] - points[rows]) / spacing
         pairs = [(a, b) for a in range(d) for b in range(a, d)]
         terms = [away, *(away[:, [a]] * away[:, [b]] * (0.5 if a == b else 1.0) for a, b in pairs)]

@@ -8,7 +8,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from ...mesh.connectivity import following, rows_with, take_rows
+from ...connectivity import following, rows_of, rows_with, take_rows
 from ...mesh.faces import Faces
 from .mend import cells_of
 
@@ -92,7 +92,7 @@ def _depths(feet: Feet, faces: Faces, walls: np.ndarray, center: np.ndarray, nor
     Means are those of the middles of the sides of the triangles around the center: exact if the depth is a quadratic.
     """
     starts, corners = take_rows(faces.starts, faces.corners, walls)
-    row = np.repeat(np.arange(len(walls)), np.diff(starts))
+    row = rows_of(starts)
     a, b, c = faces.points[corners], faces.points[corners[following(starts)]], center[walls][row]
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
     outer, inner = (((feet(x) - x) * normal[walls][row]).sum(axis=1) for x in ((a + b) / 2, (a + c) / 2))

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy
 
+from ...connectivity import rows_and_places
 from .wall_surface import WallSurface, nearest
 
 _ROUNDS = 60
@@ -39,8 +40,7 @@ def cross_cells(
     h = sizes[nearest(tree, ends.mean(axis=1))[1]]
     length = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
     pieces = np.maximum(1, np.ceil(2 * length / np.minimum(h, sizes.min() * 4))).astype(np.int64)
-    edge = np.repeat(np.arange(len(ends)), pieces)
-    number = np.arange(len(edge)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
+    edge, number = rows_and_places(pieces)
     low, high = number / pieces[edge], (number + 1) / pieces[edge]
 
     def at(e: np.ndarray, t: np.ndarray) -> np.ndarray:

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...mesh.connectivity import take_rows
+from ...connectivity import starts_of, take_rows
 from ...mesh.faces import Faces
 from ...mesh.geometry import cell_geometry, face_geometry
 from ..gate import LEAST_DETERMINANT, LEAST_MEASURE
@@ -352,7 +352,7 @@ class Edits:
         starts, corners = take_rows(m.starts, m.corners, rows)
         counts = np.concatenate([np.diff(starts), [len(f[2]) for f in new]]).astype(np.int64)
         corners = np.concatenate([corners, [v for f in new for v in f[2]]]).astype(np.int32)
-        starts, corners = take_rows(np.concatenate([[0], np.cumsum(counts)]), corners, order)
+        starts, corners = take_rows(starts_of(counts), corners, order)
         points = np.concatenate([m.points, np.zeros((self.next_point - len(m.points), 3))])
         for v, x in self._points.items():
             points[v] = x

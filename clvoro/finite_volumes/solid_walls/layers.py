@@ -11,9 +11,9 @@ import numpy as np
 import scipy
 
 from ...arguments import format_point, warn
+from ...connectivity import distinct, following, rows_and_places, rows_of, rows_with, take_rows
 from ...errors import MismatchWarning
 from ...geometry.boundary_layers import DEEPER, INNER_DEPTH, OF_GAP, Layers
-from ...mesh.connectivity import distinct, following, rows_with, take_rows
 from ...mesh.diagram import Diagram
 from ...mesh.faces import Faces
 from ...mesh.geometry import sum_rows
@@ -128,7 +128,7 @@ class _LayeredWalls:
         self.rows = np.arange(f.n_inner, len(f))
         self.patch = -1 - f.neighbor[self.rows].astype(np.int64)
         self.starts, corners = take_rows(f.starts, f.corners, self.rows)
-        self.face = np.repeat(np.arange(len(self.rows)), np.diff(self.starts))
+        self.face = rows_of(self.starts)
         self.vertices, place = np.unique(corners, return_inverse=True)
         self.corners = place.reshape(-1)
         self.stiff = np.zeros(f.n_cells, bool)
@@ -491,8 +491,7 @@ class _LayeredWalls:
         """Return the moved vertices and those of all levels but the innermost, (k, 3), and the first of these, (u,)."""
         counts = np.where(active, self.levels, 0)
         base = len(moved) + np.cumsum(counts) - counts
-        vertex = np.repeat(np.arange(len(active)), counts)
-        level = np.arange(len(vertex)) + len(moved) - base[vertex]
+        vertex, level = rows_and_places(counts)
         way = moved[self.vertices[vertex]] - walls[vertex]
         points = walls[vertex] + self.level_ends[vertex, level][:, None] * way
         sliding = np.flatnonzero(self.border[vertex] & (level > 0))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ...mesh.connectivity import rows_with, take_rows
+from ...connectivity import rows_with, take_rows
 from ...mesh.faces import Faces
 from ..defects import DefectLimits
 from ..gate import rejected_cells

@@ -10,8 +10,8 @@ import numpy as np
 import scipy
 
 from ...arguments import format_point, warn
+from ...connectivity import distinct, following, ranges, rows_of, starts_of, take_ranges, take_rows
 from ...errors import InputError, MismatchWarning
-from ...mesh.connectivity import distinct, following, take_ranges, take_rows
 from ...mesh.diagram import Diagram
 from ...mesh.faces import Faces
 from ..collapse import collapse_short
@@ -587,7 +587,7 @@ class _Maker:
         Parts that still have two corners are left out.
         """
         after = parts.items[following(parts.starts)]
-        face = parts.face[np.repeat(np.arange(len(parts.face)), np.diff(parts.starts))]
+        face = parts.face[rows_of(parts.starts)]
         creased = parts.chord & ~self.rounded[self.owner[face]] & ~self.rounded[self.neighbor[face]]
         chords = np.flatnonzero(creased)
         one, other = self.site[parts.items[chords]], self.site[after[chords]]
@@ -630,7 +630,7 @@ class _Maker:
         counts += added
         made = TrimmedFaces(
             parts.face,
-            np.concatenate([[0], np.cumsum(counts)]),
+            starts_of(counts),
             np.insert(parts.items, rows + 1, first + taken),
             np.insert(parts.chord, rows + 1, True),
         )
@@ -647,8 +647,7 @@ class _Maker:
         found = np.full(len(face), -1)
         key = crossings.cells[:, 0] * self.n + crossings.cells[:, 1]
         low, high = np.searchsorted(key, face, "left"), np.searchsorted(key, face, "right")
-        row = np.repeat(np.arange(len(face)), high - low)
-        which = take_ranges(low, high - low, np.arange(len(key)))[1]
+        row, which = ranges(low, high - 1)
         site = self.surface.n_patches + crossings.edge[which]
         fits = (self.surface.common(site, one[row])[0] > 0) & (self.surface.common(site, other[row])[0] > 0)
         row, which = row[fits], which[fits]
@@ -816,8 +815,8 @@ class _Maker:
         row = np.concatenate([self.cells.row[far], np.full(len(parts.face), -1)])
         inner = np.lexsort((neighbor, owner))
         walls = np.lexsort((wall_owner, wall_patch))
-        one = take_rows(np.concatenate([[0], np.cumsum(counts)]), items, inner)
-        two = take_rows(np.concatenate([[0], np.cumsum(wall_counts)]), wall_items, walls)
+        one = take_rows(starts_of(counts), items, inner)
+        two = take_rows(starts_of(wall_counts), wall_items, walls)
         f = len(inner) + len(walls)
         owner = np.concatenate([owner[inner], wall_owner[walls]])
         neighbor = np.concatenate([neighbor[inner], -1 - wall_patch[walls]])

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ...mesh.connectivity import rows_with, take_rows, used_indices
+from ...connectivity import rows_with, take_rows, used_indices
 from ...mesh.faces import Faces
 from .wall_surface import WallSurface
 

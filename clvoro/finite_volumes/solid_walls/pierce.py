@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ...connectivity import starts_of
 from .wall_surface import WallSurface
 
 ON = 0.03
@@ -72,7 +73,7 @@ def pierce_edges(
     starts[leaving[0][leaving[4] == 0]] = True
     ends[leaving[0][leaving[4] == 1]] = True
     order = np.lexsort((place, row))
-    first = np.concatenate([[0], np.cumsum(np.bincount(row, minlength=len(a)))])
+    first = starts_of(np.bincount(row, minlength=len(a)))
     return PiercedEdges(starts, ends, first, row[order], points[order], tri[order])
 
 
@@ -103,7 +104,7 @@ def simplified(pierced: PiercedEdges, a: np.ndarray, b: np.ndarray, simple: np.n
     return PiercedEdges(
         starts,
         ends,
-        np.concatenate([[0], np.cumsum(np.bincount(edge, minlength=len(a)))]),
+        starts_of(np.bincount(edge, minlength=len(a))),
         edge,
         pierced.points[kept],
         pierced.triangles[kept],

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ...mesh.connectivity import following, take_ranges
+from ...connectivity import following, rows_and_places, rows_of, starts_of, take_ranges
 from .pierce import IN, WALL, PiercedEdges
 from .wall_surface import WallSurface
 
@@ -54,7 +54,7 @@ def trim_faces(
     - `h`: (f,) float
     """
     v = len(sides)
-    face = np.repeat(np.arange(len(starts) - 1), np.diff(starts))
+    face = rows_of(starts)
     crossings = np.diff(pierced.first)[edges]
     begins = np.where(forward, pierced.starts_inside[edges], pierced.ends_inside[edges])
     finishes = np.where(forward, pierced.ends_inside[edges], pierced.starts_inside[edges])
@@ -63,8 +63,7 @@ def trim_faces(
     n = int(crossings.sum()) + len(corners)
     items, inside, kept = np.empty(n, np.int64), np.empty(n, bool), np.ones(n, bool)
     items[place], inside[place] = corners, begins
-    row = np.repeat(np.arange(len(corners)), crossings)
-    number = np.arange(len(row)) - np.repeat(np.cumsum(crossings) - crossings, crossings)
+    row, number = rows_and_places(crossings)
     which = np.where(forward[row], number, crossings[row] - 1 - number)
     items[place[row] + 1 + number] = v + pierced.first[edges[row]] + which
     inside[place[row] + 1 + number] = begins[row] ^ (number % 2 == 0)
@@ -76,7 +75,7 @@ def trim_faces(
     items, gap = items[kept], ~inside[kept]
     counts = np.bincount(of, minlength=len(starts) - 1)
     gaps = np.bincount(of, gap, minlength=len(starts) - 1)
-    whole = TrimmedFaces(np.arange(len(starts) - 1), np.concatenate([[0], np.cumsum(counts)]), items, gap)
+    whole = TrimmedFaces(np.arange(len(starts) - 1), starts_of(counts), items, gap)
     several = np.flatnonzero(gaps > 1)
     simple = whole.take(np.flatnonzero((counts >= 2) & (gaps <= 1)))
     made = [simple]
@@ -140,7 +139,7 @@ def _divide(
     counts = [len(loop) for loop in lists]
     return TrimmedFaces(
         np.array(faces, np.int64),
-        np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
+        starts_of(counts),
         np.array([i for loop in lists for i in loop], np.int64),
         np.array([c for marks in chords for c in marks], bool),
     )

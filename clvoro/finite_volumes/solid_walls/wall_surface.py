@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 import scipy
 
+from ...connectivity import distinct, rows_of, starts_of, take_rows
 from ...geometry.bvh import Tree
 from ...geometry.triangles import bent_patches
-from ...mesh.connectivity import distinct, take_rows
 
 if TYPE_CHECKING:
     from ...geometry.solid.solid import Solid
@@ -168,7 +168,7 @@ class WallSurface:
         at_corners = np.bincount(pairs[0], minlength=len(self.corners))
         counts = np.concatenate([np.ones(self.n_patches, int), np.full(len(self.ends), 2), at_corners])
         items = [np.arange(self.n_patches), np.sort(self.solid.creases.patches, axis=1).ravel(), pairs[1]]
-        return np.concatenate([[0], np.cumsum(counts)]), np.concatenate(items).astype(np.int64)
+        return starts_of(counts), np.concatenate(items).astype(np.int64)
 
     def patches_of(self, site: int) -> list[int]:
         """Return the patches that meet at a site."""
@@ -182,7 +182,7 @@ class WallSurface:
         starts, items = self._site_patches
         starts_a, a = take_rows(starts, items, keys // size)
         starts_b, b = take_rows(starts, items, keys % size)
-        rows = np.concatenate([np.repeat(np.arange(len(keys)), np.diff(s)) for s in (starts_a, starts_b)])
+        rows = np.concatenate([rows_of(s) for s in (starts_a, starts_b)])
         pairs = np.sort(rows * self.n_patches + np.concatenate([a, b]))
         shared = distinct(pairs[:-1][pairs[1:] == pairs[:-1]])
         number, least = np.bincount(shared // self.n_patches, minlength=len(keys)), np.full(len(keys), -1)

@@ -18,6 +18,7 @@ import numpy as np
 import scipy
 import shapely
 
+from ...connectivity import starts_of
 from ..domain import Domain
 from ..fixed_generators import FixedGenerators
 from .lines import Network, wall_lines
@@ -147,7 +148,7 @@ def place_pairs(domain: Domain, network: Network, size: Callable[[np.ndarray], n
         domain.wrap(np.reshape(layout.points, (-1, 2))),
         np.reshape(layout.centers, (-1, 2)),
         _CLEAR * np.array(layout.radii),
-        np.concatenate([[0], np.cumsum(counts)]).astype(np.int32),
+        starts_of(counts, np.int32),
         np.array([b for _, b in members], np.int32),
         np.reshape(placing.dropped, (-1, 2)),
         np.reshape(layout.chords, (-1, 2, 2)),

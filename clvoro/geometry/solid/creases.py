@@ -8,7 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
-from ...graphs import components
+from ...connectivity import components
 
 SMOOTH, CONVEX, CONCAVE = 0, 1, 2
 """Kinds of the sides and corners of triangles; a patch goes on across smooth and convex ones."""

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import scipy
 
-from ...graphs import components
+from ...connectivity import components
 from ..columns import Columns
 from ..nearest_triangles import NearestTriangles
 from ..surface import Surface

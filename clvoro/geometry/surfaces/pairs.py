@@ -18,6 +18,7 @@ import numpy as np
 import scipy
 
 from ...arguments import format_point
+from ...connectivity import rows_and_places
 from ...errors import InputError
 from ..domain import Domain
 from ..fixed_generators import FixedGenerators
@@ -210,8 +211,8 @@ def _lines_inside(sheets: Sheets, domain: Domain, edges: np.ndarray) -> list[tup
     longest, inside = float(domain.extent.max()) / _PARTS, partial(_inside, domain)
     begin, end = x[sheets.edges[edges, 0]], x[sheets.edges[edges, 1]]
     counts = np.maximum(np.ceil(np.linalg.norm(end - begin, axis=1) / longest), 1).astype(int)
-    row = np.repeat(np.arange(len(edges)), counts)
-    share = (np.arange(len(row)) - np.repeat(np.cumsum(counts) - counts, counts)) / counts[row]
+    row, share = rows_and_places(counts)
+    share = share / counts[row]
     points = np.vstack([begin[row] + share[:, None] * (end - begin)[row], end[-1:]])
     vertex = np.append(np.where(share == 0, sheets.edges[edges[row], 0], -1), sheets.edges[edges[-1], 1])
     kept = inside(0.5 * (points[1:] + points[:-1]))

@@ -10,6 +10,7 @@ import numpy as np
 import scipy
 
 from ...arguments import format_point
+from ...connectivity import starts_of
 from ...errors import InputError
 from ..bvh import Tree
 from ..nearest_triangles import Feet, NearestTriangles, heights_over
@@ -56,7 +57,7 @@ class Sheets:
         edge = edge.reshape(-1)
         count = np.bincount(edge)
         order = np.argsort(edge, kind="stable")
-        starts = np.concatenate([[0], np.cumsum(count)])
+        starts = starts_of(count)
         pair = np.flatnonzero(count == 2)
         one, other = order[starts[pair]], order[starts[pair] + 1]
         twin = np.full(3 * t, -1)
@@ -94,7 +95,7 @@ class Sheets:
         )
         found, lists = edges[rows][along], [lists[k] for k in along.tolist()]
         found[flipped] = found[flipped, ::-1]
-        counts = np.concatenate([[0], np.cumsum([len(items) for items in lists])])
+        counts = starts_of([len(items) for items in lists])
         return cls(surface, patch, normals, found, chain, corners, counts, np.concatenate(lists))
 
     @property

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ...arguments import format_point
+from ...connectivity import components
 from ...errors import InputError, InputTypeError
 from ...files import pack_array, unpack_array
-from ...graphs import components
 from ..borders import Borders, Size
 from ..columns import Columns
 from ..domain import Domain

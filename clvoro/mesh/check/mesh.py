@@ -12,8 +12,7 @@ from collections.abc import Callable
 import numpy as np
 import scipy
 
-from ...graphs import components
-from ..connectivity import take_rows
+from ...connectivity import components, rows_of, take_rows
 from ..diagram import Diagram
 from ..geometry import sum_rows
 from ..lookup import lifted, power_tree
@@ -44,7 +43,7 @@ def check_corners(check: Check) -> None:
         a, b = (take_rows(starts, corners, rows) for rows in (here, there))
         wrong = np.diff(a[0]) != np.diff(b[0])
         same = ~wrong
-        row_a, row_b = (np.repeat(np.arange(len(here)), np.diff(x[0])) for x in (a, b))
+        row_a, row_b = (rows_of(x[0]) for x in (a, b))
         one, two = a[1][same[row_a]], b[1][same[row_b]]
         row = row_a[same[row_a]]
         off = one[np.lexsort((one, row))] != two[np.lexsort((two, row))]

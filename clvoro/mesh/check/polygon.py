@@ -6,8 +6,8 @@ import numpy as np
 import scipy
 import shapely
 
+from ...connectivity import following, rows_of
 from ...geometry.polygon import BOUNDARY_SHIFTS, Polygon
-from ..connectivity import following
 from ..diagram import Diagram
 from .findings import Check
 from .rebuilt import Rebuilt
@@ -27,7 +27,7 @@ def check_outlines(check: Check) -> None:
         lambda f: f"face {f} of cell {owner[f]} ends in vertex {ends[f, 1]}, where no face of it begins",
     )
     corners, starts = d.cell_vertices, d.cell_vertex_starts
-    cell = np.repeat(np.arange(len(d)), np.diff(starts))
+    cell = rows_of(starts)
     # Count each way from vertex to vertex, minus the ways back: the two ways of a bridge cancel.
     of = np.concatenate([owner, cell])
     a = np.concatenate([ends[:, 0], corners])

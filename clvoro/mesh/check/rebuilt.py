@@ -8,8 +8,8 @@ import numpy as np
 import scipy
 import shapely
 
+from ...connectivity import following, rows_of
 from ...geometry.sphere import Sphere, arc_excess, triangle_areas
-from ..connectivity import following
 from ..diagram import Diagram
 from ..geometry import sum_rows
 from .findings import ROUNDINGS, Check
@@ -113,7 +113,7 @@ class Rebuilt:
         far, size = self._extent(d)
         # The host adds the origin in float64.
         self.unit = eps * size + fine * far
-        self.owner = np.repeat(np.arange(n), np.diff(d.neighbor_starts))
+        self.owner = rows_of(d.neighbor_starts)
         self._set_cells(d)
         self.perimeters = np.bincount(self.owner, self.measures, minlength=n)
         self._distances = np.linalg.norm(d.vertices[self.corners] - d.points[self.cells], axis=1)
@@ -158,7 +158,7 @@ class Rebuilt:
     def _set_polyhedra(self, d: Diagram) -> None:
         """Set areas and middles of faces, and the corners and edges of cells, in 3D."""
         at, x = d.points[self.owner], d.vertices
-        face = np.repeat(np.arange(len(self.owner)), np.diff(d.face_vertex_starts))
+        face = rows_of(d.face_vertex_starts)
         first = d.face_vertex_starts[:-1][face]
         after = following(d.face_vertex_starts)
         a = x[d.face_vertices] - at[face]

@@ -10,6 +10,7 @@ import numpy as np
 import pyopencl as cl
 import pyopencl.array as cla
 
+from ...connectivity import rows_and_places
 from ...geometry.polygon import BOUNDARY_SHIFTS, Polygon
 from ...opencl.device_array import buffer_of
 from ..device_diagram import Follow, Tessellation, read_report
@@ -77,8 +78,7 @@ class Cut(DomainSteps):
         for _ in range(2):
             h = np.asarray(self._spacing(at + way / 2), float)
             counts = np.ceil(np.hypot(*way.T) / (SAMPLED * h)).clip(1).astype(int)
-            rows = np.repeat(np.arange(len(at)), counts)
-            place = np.arange(len(rows)) - np.repeat(np.cumsum(counts) - counts, counts)
+            rows, place = rows_and_places(counts)
             way = way[rows] / counts[rows, None]
             at = at[rows] + place[:, None] * way
         inner = graded_places(self._polygon, self._spacing, inside=True)

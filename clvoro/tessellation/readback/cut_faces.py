@@ -6,6 +6,7 @@ from functools import cached_property
 
 import numpy as np
 
+from ...connectivity import rows_of, starts_of
 from ..clipped.boundary_crossings import UNTOUCHED
 from ..clipped.trim import Trimmed
 from ..vertices import Vertices
@@ -68,7 +69,7 @@ class CutFaces:
         """
         corners = shared.cell_vertices.get()
         ends = np.empty((self.m, 2), np.int64)
-        owner = np.repeat(np.arange(len(starts) - 1), np.diff(starts))
+        owner = rows_of(starts)
         whole = self._slots[owner] == UNTOUCHED
         i = owner[whole]
         k = np.flatnonzero(whole) - starts[i]
@@ -106,7 +107,7 @@ def chain_faces(slots: np.ndarray, ends: np.ndarray, starts: np.ndarray) -> tupl
     - `lengths`: the lengths of the loops of those rows that have several.
     """
     ends, m = ends[slots], len(slots)
-    row = np.repeat(np.arange(len(starts) - 1), np.diff(starts))
+    row = rows_of(starts)
     following = np.arange(1, m + 1)
     filled = np.diff(starts) > 0  # cells of power diagrams may be empty
     following[starts[1:][filled] - 1] = starts[:-1][filled]
@@ -133,7 +134,7 @@ def join_loops(corners: np.ndarray, starts: np.ndarray, several: dict[int, list[
             for loop in loops[1:]:
                 chain += [loops[0][:1], loop, loop[:1]]
             rows[i] = np.concatenate(chain)
-        starts, corners = np.concatenate([[0], np.cumsum([len(r) for r in rows])]), np.concatenate(rows)
+        starts, corners = starts_of([len(r) for r in rows]), np.concatenate(rows)
     return starts.astype(np.int32), corners.astype(np.int32)
 
 

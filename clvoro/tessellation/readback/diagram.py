@@ -10,12 +10,11 @@ from typing import cast
 import numpy as np
 import pyopencl.array as cla
 
+from ...connectivity import first_nodes, rows_of, starts_of, used_indices
 from ...errors import InputError
 from ...finite_volumes.borders import on_surfaces
 from ...geometry.domain import ClipBox, Domain
 from ...geometry.solid.solid import Solid
-from ...graphs import first_nodes
-from ...mesh.connectivity import used_indices
 from ...mesh.diagram import Diagram
 from ...opencl.engine import Engine
 from ...opencl.primitives import Gather, Lists
@@ -127,13 +126,6 @@ def order_of(labels: np.ndarray) -> np.ndarray:
     places = np.full(largest + 1, -1, np.int32)
     places[labels] = np.arange(len(labels), dtype=np.int32)
     return places[places >= 0].astype(np.intp)
-
-
-def starts_of(counts: np.ndarray) -> np.ndarray:
-    """Return where lists of `counts` (n,) items begin, and the end of the last, (n + 1,) int32."""
-    found = np.zeros(len(counts) + 1, np.int32)
-    np.cumsum(counts, out=found[1:])
-    return found
 
 
 def kept_faces(t: Tessellation, m: int, copy: bool) -> Tessellation:
@@ -262,7 +254,7 @@ class _DiagramReader:
         if self.codes is not None:
             # The two half-faces at a periodic boundary have separate loops.
             seen = seen[: self.m]
-            i, j = np.repeat(np.arange(self.n), np.diff(self.t.starts.get())), self.t.neighbors.get()
+            i, j = rows_of(self.t.starts.get()), self.t.neighbors.get()
             inner, last = np.flatnonzero(j >= 0), 3**self.engine.dim - 1
             i, j, code = i[inner].astype(np.int64), j[inner].astype(np.int64), self.codes[inner]
             here = inner[np.lexsort((code, j, i))]
@@ -276,7 +268,7 @@ class _DiagramReader:
         starts = self.t.starts.get()
         if self.kept is None:
             return starts
-        return np.concatenate([[0], np.cumsum(self.kept)])[starts]
+        return starts_of(self.kept)[starts]
 
     @cached_property
     def counts(self) -> np.ndarray:
@@ -393,7 +385,7 @@ class _DiagramReader:
         if self.lists is not None and self.whole is self.t:
             # The loops of a cell's faces follow one another on the device, too.
             begins = self.loop_starts[self.starts]
-            to = starts_of(np.diff(begins)[self.order])
+            to = starts_of(np.diff(begins)[self.order], np.int32)
             upload = self.engine.upload
             loops = Lists(self.lists.order, upload(begins, np.int32), upload(to, np.int32))
             return Gather(self.engine).lists(loops, self.faces.vertices[: int(to[-1])]).get()
@@ -460,7 +452,7 @@ class _DiagramReader:
         return found
 
     def neighbor_starts(self) -> np.ndarray:
-        return starts_of(self.counts)
+        return starts_of(self.counts, np.int32)
 
     def neighbors(self) -> np.ndarray:
         ranks = np.append(self.ranks, np.full(self.t.rows - self.n, -1, np.int32))
@@ -523,7 +515,7 @@ class _DiagramReader:
     def face_vertex_starts(self) -> np.ndarray:
         if self.cut is not None:
             return (2 * np.arange(self.m + 1)).astype(np.int32)
-        return starts_of(np.take(np.diff(self.loop_starts), self._in_whole(self.slots)))
+        return starts_of(np.take(np.diff(self.loop_starts), self._in_whole(self.slots)), np.int32)
 
     def face_vertices(self) -> np.ndarray:
         return self.corners[1]

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pyopencl.array as cla
 
+from ...connectivity import starts_of
 from ...errors import InputError
 from ...geometry.box import Box
 from ...geometry.domain import Domain
@@ -22,7 +23,7 @@ from ...opencl.probe import check_process
 from ..device_diagram import Tessellation
 from ..stages import TessellationStages
 from ..tessellator import Tessellator
-from .diagram import fetch_diagram, order_of, starts_of
+from .diagram import fetch_diagram, order_of
 
 
 def fetch_part(engine: Engine, domain: Domain, t: Tessellation, labels: cla.Array) -> Diagram:

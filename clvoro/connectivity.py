@@ -1,10 +1,35 @@
-"""Ragged arrays: rows of different lengths, as `starts` and `items`."""
+"""Connectivity as arrays: ragged rows, as `starts` and `items`, sets of indices, and components of graphs."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 
 import numpy as np
+import scipy
+
+
+def starts_of(counts: np.ndarray | list[int], dtype: type = np.int64) -> np.ndarray:
+    """Return where rows of `counts` (n,) items begin, and the end of the last, (n + 1,)."""
+    found = np.zeros(len(counts) + 1, dtype)
+    np.cumsum(counts, out=found[1:])
+    return found
+
+
+def rows_of(starts: np.ndarray) -> np.ndarray:
+    """Return the row of each item."""
+    return np.repeat(np.arange(len(starts) - 1), np.diff(starts))
+
+
+def rows_and_places(counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return for each item of rows of `counts` (n,) items its row, and its place in the row."""
+    row = np.repeat(np.arange(len(counts)), counts)
+    return row, np.arange(len(row)) - np.repeat(np.cumsum(counts) - counts, counts)
+
+
+def ranges(first: np.ndarray, last: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return all pairs (i, k) with first[i] <= k <= last[i]."""
+    i, place = rows_and_places(last - first + 1)
+    return i, place + first[i]
 
 
 def following(starts: np.ndarray) -> np.ndarray:
@@ -32,8 +57,6 @@ def used_indices(indices: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarra
 
 def inverse(starts: np.ndarray, items: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
     """Return for each of `size` items the rows of the ragged array `starts` and `items` that have it, also ragged."""
-    import scipy.sparse
-
     rows = scipy.sparse.csc_array((np.ones(len(items), np.int8), items, starts), (size, len(starts) - 1)).tocsr()
     return rows.indptr, rows.indices
 
@@ -109,3 +132,15 @@ def independent(sets: np.ndarray, cells: np.ndarray, priority: np.ndarray, n: in
         going = left[sets]
         sets, cells = sets[going], cells[going]
     return chosen
+
+
+def components(n: int, i: np.ndarray, j: np.ndarray) -> tuple[int, np.ndarray]:
+    """Return the number of connected components of a graph of `n` nodes with edges `i` to `j`, and each node's."""
+    graph = scipy.sparse.coo_array((np.ones(len(i), bool), (i, j)), shape=(n, n))
+    return scipy.sparse.csgraph.connected_components(graph, directed=False)
+
+
+def first_nodes(n: int, i: np.ndarray, j: np.ndarray) -> np.ndarray:
+    """Return for each node of a graph of `n` nodes with edges `i` to `j` the first one of its component, (n,) int."""
+    label = components(n, i, j)[1]
+    return np.unique(label, return_index=True)[1][label]
