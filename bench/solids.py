@@ -19,8 +19,9 @@ With `--booleans N` the solids are N random booleans of boxes, balls and cylinde
 whose numbers `--only` lists, with about `--cells` cells each, in a process that may crash or hang. Each is accepted,
 rejected, refused (by a message, before there is a mesh), or it fails: an exception, a crash, no end within the limit, a
 cell that is not closed, or walls that are off by more than 0.1 h in the mean. Seconds and the limit are processor time.
-`--files FOLDER` does the same for all STL and OBJ files below a folder, as `*.stl.gz` too: for the inside of each
-surface, and for the air around it with sizes of h / 2 to 2 h. Surfaces are repaired. Debian's package openfoam-examples
+`--files FOLDER` does the same for all files of surfaces below a folder, as `*.stl.gz` too: for the inside of each
+surface, and for the air around it with sizes of h / 2 to 2 h. Surfaces are read with the remedies that messages name;
+wraps have no inside, so that both are the air around them. Debian's package openfoam-examples
 has many in /usr/share/doc/openfoam-examples.
 With `--layers` all patches of the solids have layers of prisms, such as `0.5:5:1.3`: 0.5 h thick, five layers, growth
 1.3. A row has the inner cells and the prisms, the mean thickness over the one given at the vertices of walls, the
@@ -36,6 +37,7 @@ from __future__ import annotations
 import argparse
 import math
 import multiprocessing
+import re
 import resource
 import signal
 import tempfile
@@ -59,6 +61,7 @@ from solver_ready import figures_of
 import clvoro
 from clvoro.adaptation.options import EFFORTS
 from clvoro.errors import ClvoroError
+from clvoro.geometry.surface_files import SOLIDS, joined, read_parts
 from clvoro.io.check_mesh import check_case
 
 COLUMNS = {
@@ -154,6 +157,7 @@ def draw(result: clvoro.Result, path: Path, title: str) -> None:
 
 BOOLEAN_COLUMNS = {
     "solid": lambda r: r["solid"],
+    "read": lambda r: r.get("read", ""),
     "cells": lambda r: r["cells"],
     "s": PLANE_COLUMNS["s"],
     "non-orth. max, mean": COLUMNS["non-orth. max, mean"],
@@ -162,28 +166,50 @@ BOOLEAN_COLUMNS = {
     "verdict": lambda r: r["verdict"],
     "what and where": lambda r: r["complaints"],
 }
+KINDS = tuple(f".{kind}" for kind in SOLIDS)
+_WRAPS = 40
+"""Extent of a file's surface over its wrap."""
 _OFF = 0.1
 """Largest mean distance of the walls from the surface, over h; a chord of a curved wall is nearer."""
 
 
-def part_of(job: int | tuple[Path, bool], cells: int) -> tuple[clvoro.Solid, float, Any]:
-    """Return a random solid by its number, or the inside or outside of a file's surface, with h and the size field."""
+def part_of(job: int | tuple[Path, bool], cells: int) -> tuple[clvoro.Solid, float, Any, str]:
+    """Return a random solid by its number, or the inside or outside of a file's surface, with h, sizes and remedies."""
     if isinstance(job, int):
         solid = solid_of(random_part(job))
         h = (solid.measure / cells) ** (1 / 3)
-        return solid, h, h
+        return solid, h, h, ""
     path, outside = job
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        solid = clvoro.Solid.read(path, repair=True, name=path.name)
-    if not outside:
-        h = (solid.measure / cells) ** (1 / 3)
-        return solid, h, h
+    solid, told = read_as_told(path)
+    h = (solid.measure / cells) ** (1 / 3)
+    if not outside and "wrap" not in told:
+        return solid, h, h, told
     lower, upper = np.array(solid.lower), np.array(solid.upper)
     room = 0.6 * (upper - lower).max()
     air = clvoro.Solid.outside(solid, (lower - room, upper + room))
     h = (air.measure / cells) ** (1 / 3)
-    return air, h, growing(air, set(air.boundary_names) & set(solid.boundary_names), h)
+    return air, h, growing(air, set(air.boundary_names) & set(solid.boundary_names), h), told
+
+
+def read_as_told(path: Path) -> tuple[clvoro.Solid, str]:
+    """Return the solid in a file, read with the remedies that messages name until there is one, and those remedies."""
+    options: dict[str, Any] = {}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        while True:
+            try:
+                return clvoro.Solid.read(path, **options, name=path.name), ", ".join(options) or "as it is"
+            except ClvoroError as error:
+                said = str(error)
+                join = re.search(r"(?<=Here join=)[\d.e+-]+", said)
+                if join and "join" not in options:
+                    options["join"] = float(join[0])
+                elif "repair=True" in said and "repair" not in options:
+                    options["repair"] = True
+                elif "wrap=" in said and "wrap" not in options:
+                    options = {"wrap": float(np.ptp(joined(read_parts(path, SOLIDS))[0], axis=0).max()) / _WRAPS}
+                else:
+                    raise
 
 
 def growing(solid: clvoro.Solid, walls: Iterable[str], h: float) -> clvoro.sizing.Distance:
@@ -195,22 +221,21 @@ def parts(options: argparse.Namespace) -> Iterable[Job]:
     """Return random solids, or the inside and the outside of the surface in each file."""
 
     def made(job: int | tuple[Path, bool]) -> Made:
-        solid, h, size = part_of(job, options.cells)
-        return solid, size, {}, partial(defects, h=h)
+        solid, h, size, told = part_of(job, options.cells)
+        return solid, size, {}, partial(defects, h=h, told=told)
 
     for number in counts(options.only) or range(options.first, options.first + options.booleans):
         yield {"solid": number}, partial(made, number)
     if options.files:
-        found = sorted(
-            p for p in options.files.rglob("*") if p.name.lower().removesuffix(".gz").endswith((".stl", ".obj"))
-        )
-        once = {p.read_bytes(): p for p in reversed(found)}  # tutorials share files
-        for path, outside in product(once.values(), (False, True)):
+        found = [p for p in options.files.rglob("*") if p.name.lower().removesuffix(".gz").endswith(KINDS)]
+        found.sort(key=lambda p: (p.stat().st_size, p))
+        once = {p.read_bytes(): p for p in found}  # tutorials share files
+        for outside, path in product((False, True), once.values()):
             yield {"solid": f"{path.name}, {'outside' if outside else 'inside'}"}, partial(made, (path, outside))
 
 
-def defects(result: clvoro.Result, case: Path, h: float) -> dict[str, Any]:
-    """Return the verdict on a mesh with cells that are open, or walls that are off the surface."""
+def defects(result: clvoro.Result, case: Path, h: float, told: str) -> dict[str, Any]:
+    """Return how a file is read, and a verdict on cells that are open, and on walls that are off the surface."""
     d, f, solid = result.diagram, result.diagram.faces, result.diagram.domain
     openness = np.zeros((len(d), 3))
     inner = f.neighbor >= 0
@@ -218,9 +243,9 @@ def defects(result: clvoro.Result, case: Path, h: float) -> dict[str, Any]:
     np.subtract.at(openness, f.neighbor[inner], (f.normal * f.area[:, None])[inner])
     off, open_ = abs(d.volumes.sum() - solid.measure) / solid.boundary_measure / h, np.abs(openness).max()
     if open_ < 1e-9 * h * h and off < _OFF:
-        return {}
+        return {"read": told}
     what = f"walls are off by {off:.2f} h, cells are open by {open_:.1e}"
-    return {"ok": False, "verdict": "failed", "complaints": what}
+    return {"read": told, "ok": False, "verdict": "failed", "complaints": what}
 
 
 LAYER_COLUMNS = {

@@ -51,6 +51,7 @@ TRIANGLES = [(0, 2, 1), (0, 1, 3), (1, 2, 3), (0, 3, 2)]
 BLOCK, FIRST = clvoro.Solid.box((0, 0, 0), (1, 1, 1)), clvoro.Layers(0.01, 2, edges=["xMin"])
 TURNED = np.array(TRIANGLES)[:, ::-1]
 CORNERS = np.array([(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)], float)
+CROSSED = np.array([(0, 0, 0), (1, 1, 0), (1, 0, 0), (0, 1, 0)])
 POINTS = np.random.default_rng(5).random((30, 2))
 RECORDS = np.array([(0.5, 0.2), (0.1, 0.3)], dtype=[("x", float), ("y", float)])
 WKT = "POLYGON ((0 0, 1 0, 1 1, 0 0))"
@@ -603,7 +604,17 @@ ROWS = [
         lambda t: clvoro.Solid(CORNERS, [*TRIANGLES, TRIANGLES[0]]),
         lambda t: clvoro.Solid(CORNERS, [*TRIANGLES, TRIANGLES[0]], repair=True),
     ),
-    (lambda t: clvoro.Solid(CORNERS, TRIANGLES[:3]), lambda t: clvoro.Solid(CORNERS, TRIANGLES)),
+    (lambda t: clvoro.Solid(CORNERS, TRIANGLES[:3]), lambda t: clvoro.Solid(CORNERS, TRIANGLES[:3], repair=True)),
+    (lambda t: clvoro.Solid(CORNERS, TRIANGLES[2:3]), lambda t: clvoro.Solid(CORNERS, TRIANGLES[2:3], bottom=-1)),
+    (
+        lambda t: clvoro.Solid(CORNERS, TRIANGLES[2:3], bottom=0),
+        lambda t: clvoro.Solid(CORNERS, TRIANGLES[2:3], bottom=-0.1),
+    ),
+    (lambda t: clvoro.Solid(CORNERS, TRIANGLES, bottom=-1), lambda t: clvoro.Solid(CORNERS, TRIANGLES)),
+    (
+        lambda t: clvoro.Solid(CROSSED, [(0, 1, 2), (0, 2, 3)], bottom=-1),
+        lambda t: clvoro.Solid(CROSSED[[0, 2, 1, 3]], [(0, 1, 2), (0, 2, 3)], bottom=-1),
+    ),
     (
         lambda t: clvoro.Solid(CORNERS, [*TRIANGLES[:3], TRIANGLES[3][::-1]]),
         lambda t: clvoro.Solid(CORNERS, [*TRIANGLES[:3], TRIANGLES[3][::-1]], repair=True),

@@ -197,10 +197,10 @@ class Surface:
         """Whether every edge belongs to an even number of triangles. Then the surface has an inside."""
         return not (self._edges[1] % 2).any()
 
-    def require_closed(self) -> None:
+    def require_closed(self, remedy: str = "") -> None:
         """Raise if the surface is not closed.
 
-        Raises `InputError` with the number of open edges, and the place of the first one.
+        Raises `InputError` with the number of open edges, the place of the first one, and a `remedy`.
         """
         if self.closed:
             return
@@ -209,8 +209,8 @@ class Surface:
             a, b = (format_point(self.vertices[i]) for i in edges[0])
             raise InputError(
                 f"{self.name} is open: {len(edges)} edges belong to a single triangle, the first from "
-                f"{a} to {b}; expected a closed surface: fill the holes, or pass join= if "
-                "vertices that should coincide are a little apart"
+                f"{a} to {b}; expected a closed surface"
+                + (remedy or ": fill the holes, or pass join= if vertices that should coincide are a little apart")
             )
         edges, count, where = self._edges
         odd = np.flatnonzero(count % 2)
@@ -218,7 +218,7 @@ class Surface:
         a, b = (format_point(self.corners[triangle, (side + k) % 3]) for k in (0, 1))
         raise InputError(
             f"{self.name} is not closed: {len(odd)} edges belong to an odd number of triangles, the "
-            f"first, from {a} to {b}, to {count[odd[0]]}; remove the surplus triangles"
+            f"first, from {a} to {b}, to {count[odd[0]]}; " + (remedy or "remove the surplus triangles")
         )
 
     def crossings(self) -> np.ndarray:

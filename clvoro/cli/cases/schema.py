@@ -651,6 +651,7 @@ class SolidTable(Kind, tag="solid"):
     repair: bool | None = None
     wrap: Positive | None = None
     inside: Space | None = None
+    bottom: float | None = None
     surfaces: Text | list[SurfaceTable] | None = None
 
     def build(self, folder: Path, domain: Any = None) -> Solid:

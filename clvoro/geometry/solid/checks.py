@@ -9,7 +9,7 @@ import numpy as np
 import scipy
 import shapely
 
-from ...arguments import format_point
+from ...arguments import check_number, format_point
 from ...errors import InputError
 from ..columns import Columns
 from ..surface import Surface
@@ -49,6 +49,24 @@ def repeated_triangles(triangles: np.ndarray) -> np.ndarray:
     """Return the triangles (t, 3) that have the same corners as an earlier one, (k,) int."""
     _, first = np.unique(np.sort(triangles, axis=1), axis=0, return_index=True)
     return np.setdiff1d(np.arange(len(triangles)), first)
+
+
+def _closed_by(surface: Surface, parts: Sequence[str]) -> str:
+    """Return what closes an open surface, as a sentence: a distance, a repair, or what works for any sheet.
+
+    - `parts` (t,) str: the part of each triangle.
+    """
+    join = closing_distance(surface)
+    if join is not None:
+        return f"Here join={join:g} closes it"
+    mended, _, done, _ = repaired(surface, np.zeros(len(surface), np.int64), 1)
+    if mended.closed:
+        return f"Here repair=True closes it ({'; '.join(done)})"
+    others = "" if len(set(parts)) > 1 else "If other files close it, read them together: Solid.read([...]). "
+    return (
+        f"{others}The ground below a terrain is a solid with bottom=, a height. Sheets inside of a domain are for "
+        f"with_surfaces. {_OR_WRAP}"
+    )
 
 
 def _gaps(surface: Surface, parts: Sequence[str]) -> str:
@@ -93,13 +111,7 @@ def require_bounding(
             f"{name} has {len(repeated)} duplicate triangles, the first at {where}, expected each once; remove them, "
             "or pass repair=True"
         )
-    if not surface.closed:
-        join = closing_distance(surface)
-        try:
-            surface.require_closed()
-        except InputError as error:
-            remedy = _OR_WRAP if join is None else f"Here join={join:g} closes it"
-            raise InputError(f"{error}.{_gaps(surface, parts)} {remedy}") from None
+    surface.require_closed("" if surface.closed else f".{_gaps(surface, parts)} {_closed_by(surface, parts)}")
     twin, bad = pair_sides(vertices, triangles)
     if bad.size:
         k, s = divmod(int(bad[0]), 3)
@@ -201,6 +213,45 @@ def repaired(surface: Surface, groups: np.ndarray, n_groups: int) -> tuple[Surfa
         vertices, triangles, groups = _united(vertices, triangles, groups, met)
         _turn_outwards(vertices, triangles, _shells(pair_sides(vertices, triangles)[0]), nested=True)
     return Surface(vertices, triangles, surface.name), groups, tuple(done), len(caps)
+
+
+def grounded(
+    surface: Surface, groups: np.ndarray, names: tuple[str, ...], bottom: float
+) -> tuple[Surface, np.ndarray, tuple[str, ...]]:
+    """Return the surface of the ground below a sheet, down to the height z = `bottom`, its groups, and their names.
+
+    Walls lead down from the open edges of the sheet. They and the bottom are the groups side and bottom.
+
+    Raises `InputError` if the sheet has no open edges, is not above the bottom, or its border crosses itself seen from
+    above.
+    """
+    check_number(f"{surface.name} bottom", bottom)
+    vertices, triangles = surface.welded
+    low = vertices[np.unique(triangles)][:, 2].min()
+    if not bottom < low:
+        raise InputError(f"{surface.name} bottom is {bottom:g}, expected a height below its lowest vertex, {low:g}")
+    edges = Surface(vertices, triangles).open_edges
+    rings = [ring for ring in _rings(edges) if len(ring) > 2]
+    if not rings:
+        raise InputError(f"{surface.name} has a bottom and no open edges, expected a sheet; leave out bottom")
+    shapes = [shapely.Polygon(vertices[ring, :2]) for ring in rings]
+    crossed = [k for k, shape in enumerate(shapes) if not shape.is_valid]
+    if crossed:
+        why = shapely.is_valid_reason(shapes[crossed[0]])
+        raise InputError(f"{surface.name} has a border that crosses itself seen from above: {why}; expected a terrain")
+    depth = [sum(other.contains(shape) for other in shapes if other is not shape) for shape in shapes]
+    loops = [
+        _counterclockwise(ring, shape)[:: 1 if inside % 2 == 0 else -1]
+        for ring, shape, inside in zip(rings, shapes, depth, strict=True)
+    ]
+    flat = np.concatenate(loops)[library().triangulate([vertices[loop, :2] for loop in loops])].astype(np.int64)
+    (a, b), under = edges.T, len(vertices)
+    walls = np.concatenate([np.column_stack([b, a, a + under]), np.column_stack([b, a + under, b + under])])
+    names = tuple(dict.fromkeys((*names, "side", "bottom")))
+    added = np.repeat([names.index("side"), names.index("bottom")], [len(walls), len(flat)])
+    vertices = np.concatenate([vertices, np.column_stack([vertices[:, :2], np.full(under, float(bottom))])])
+    triangles = np.concatenate([triangles, walls, flat[:, ::-1] + under])
+    return Surface(vertices, triangles, surface.name), np.concatenate([groups, added]), names
 
 
 def _united(

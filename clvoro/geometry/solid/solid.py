@@ -27,7 +27,7 @@ from ..surface_files import SOLIDS, FilePath, parts_of, read_parts, solid_argume
 from ..triangles import areas_of, pierced
 from ..wall_triangles import WallTriangles
 from . import primitives
-from .checks import repaired, require_bounding, sharp_edges, volume_inside
+from .checks import grounded, repaired, require_bounding, sharp_edges, volume_inside
 from .combining import around, boolean, named_triangles
 from .creases import (
     CONCAVE,
@@ -87,6 +87,9 @@ class Solid(Domain):
         warning says how far the surface is from the triangles at most. It suits cells of 1.5 wrap, or smaller ones.
     inside : three numbers, optional
         A point: with `wrap`, the solid is the space around this point, up to about wrap / 2 from the triangles.
+    bottom : float, optional
+        The triangles are a terrain, and the solid is the ground below them, down to this height z, repaired. Its walls
+        and its bottom are the boundaries ``side`` and ``bottom``. The air above is ``Solid.outside(ground, box)``.
 
     Attributes
     ----------
@@ -139,6 +142,7 @@ class Solid(Domain):
         creases: object = None,
         wrap: float | None = None,
         inside: Sequence[float] | None = None,
+        bottom: float | None = None,
     ):
         given = Surface(vertices, triangles, name, join)
         group = _checked_groups(name, groups, len(given))
@@ -147,7 +151,10 @@ class Solid(Domain):
         known = ["wall"] if group_names is None and groups is None else list(group_names or ())
         known += [f"group-{g}" for g in range(len(known), int(group.max()) + 1)]
         self._group_names = tuple(known)
-        if repair:
+        if bottom is not None:
+            given, group, self._group_names = grounded(given, group, self._group_names, bottom)
+            known = list(self._group_names)
+        if repair or bottom is not None:
             given, group, self.repairs, holes = repaired(given, group, len(known))
             self._group_names += tuple(f"hole-{k + 1}" for k in range(holes))
         if wrap is None and inside is not None:

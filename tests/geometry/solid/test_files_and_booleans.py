@@ -119,7 +119,8 @@ FLIPPED = np.vstack([T[:3, ::-1], T[3:]])
 @pytest.mark.parametrize(
     ("vertices", "triangles", "says"),
     [
-        (V, T[1:], "3 edges belong to a single triangle"),
+        (V, T[1:], "3 edges .* Here repair=True closes it .closed 1 flat holes"),
+        (V, T[:2], "4 edges .* with_surfaces. Or pass wrap="),
         (*with_gap(1e-4), r"join=0\.000\d+ closes it"),
         (V, np.vstack([T, T[:1], T[3:4]]), "2 duplicate triangles"),
         (V, FLIPPED, "oriented differently"),
@@ -169,6 +170,28 @@ def test_repair_mends_what_is_certain_and_says_so(vertices, triangles, says, vol
     assert solid.measure == pytest.approx(volume, rel=1e-3)
     holes = [name for name in solid.boundary_names if name.startswith("hole")]
     assert holes == (["hole-1", "hole-2"] if "holes" in says else [])
+
+
+RING = np.array([(0, 0, 1), (1, 0, 1), (1, 1, 1), (0, 1, 1)])
+
+
+@pytest.mark.parametrize(
+    ("vertices", "triangles", "bottom", "volume"),
+    [
+        (V, T[(V[T][:, :, 2] == 1).all(axis=1)], -2, 3),
+        (V + 5, T[(V[T][:, :, 2] == 0).all(axis=1)], 4, 1),  # normals downwards
+        (  # with a hole
+            np.vstack([RING, 0.5 * RING + (0.25, 0.25, 0.5)]),
+            [t for k in range(4) for t in ((k, (k + 1) % 4, (k + 1) % 4 + 4), (k, (k + 1) % 4 + 4, k + 4))],
+            0,
+            0.75,
+        ),
+    ],
+)
+def test_the_ground_below_a_sheet_is_a_solid(vertices, triangles, bottom, volume):
+    ground = Solid(vertices, triangles, group_names=["top"], bottom=bottom)
+    assert ground.measure == pytest.approx(volume)
+    assert ground.boundary_names == ("top", "side", "bottom")
 
 
 @pytest.mark.parametrize(
