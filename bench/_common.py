@@ -27,7 +27,8 @@ from clvoro import sizing
 
 PICTURES = Path(__file__).resolve().parent / "pictures"
 BOX = clvoro.Box((0, 0), (2.5, 1.5))
-CUBE = clvoro.Box((0, 0, 0), (1, 1, 1))
+SQUARE, CUBE = clvoro.Box((0, 0), (1, 1)), clvoro.Box((0, 0, 0), (1, 1, 1))
+PERIODIC, PERIODIC_CUBE = (clvoro.Box(box.lower, box.upper, periodic=True) for box in (SQUARE, CUBE))
 FIRST_SEED = 20251
 
 
@@ -265,11 +266,7 @@ SHAPE_COLUMNS: dict[str, Callable[[dict[str, Any]], object]] = {
 class Report:
     """Print rows as they come with --json, else gather them into one Markdown table.
 
-    Parameters
-    ----------
-    as_json : bool
-    columns : mapping of str to function
-        Header of each column, and what it shows of a record.
+    `columns` have the header of each column, and what it shows of a record.
     """
 
     def __init__(self, as_json: bool, columns: Mapping[str, Callable[[dict[str, Any]], object]]) -> None:

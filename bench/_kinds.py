@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from _common import domain_of, test_field
+from _common import CUBE, PERIODIC, PERIODIC_CUBE, SQUARE, domain_of, test_field
 
 import clvoro
 from clvoro import earth, sizing
@@ -14,9 +14,6 @@ from clvoro.adaptation.sampling.start import count_cells
 
 Kind = tuple[clvoro.Box | clvoro.Polygon | clvoro.Sphere, Any, dict[str, Any]]
 
-SQUARE, CUBE = clvoro.Box((0, 0), (1, 1)), clvoro.Box((0, 0, 0), (1, 1, 1))
-PERIODIC = clvoro.Box((0, 0), (1, 1), periodic=True)
-PERIODIC_CUBE = clvoro.Box((0, 0, 0), (1, 1, 1), periodic=True)
 METHODS = ("lloyd", "poisson", "coupled", "weighted", "weighted-lloyd")
 
 

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+import clvoro
 from clvoro.foam.case import FoamCase
 from clvoro.foam.fields import read_field
 from clvoro.foam.mesh import FoamMesh
@@ -79,10 +80,6 @@ class Mesh(FoamMesh):
         """Return the faces of a patch, (k,)."""
         return next(patch.faces for patch in self.patches if patch.name == name)
 
-    def polygons(self, faces: np.ndarray) -> list[np.ndarray]:
-        """Return the corners of faces in the plane, each (k, 2)."""
-        return [self.points[self.corners[self.starts[f] : self.starts[f + 1]], :2] for f in faces]
-
     def edges(self, patch: str) -> np.ndarray:
         """Return the ends of each face of `patch` of a layer of prisms in the plane, (n, 2, 2)."""
         faces = (self.points[self.corners[self.starts[f] : self.starts[f + 1]]] for f in self.patch(patch))
@@ -113,19 +110,10 @@ def write_prisms(
 ) -> None:
     """Write a plane mesh as a polyMesh of one layer of prisms, or of a wedge about the axis y = 0.
 
-    Parameters
-    ----------
-    case : Path
-    points : (v, 2) float
-    cells : sequence of (k,) int
-        Corners of each cell, counter-clockwise.
-    patch_of : callable
-        Takes the middles of boundary edges (n, 2), returns the number of the patch of each.
-    patches : mapping
-        Names and types of the patches.
-    thickness : float
-        That of a wedge is at y = 1.
-    wedge : bool
+    - `points` (v, 2) float, and `cells`: the corners of each, counter-clockwise.
+    - `patch_of` takes the middles of boundary edges (n, 2), returns the number of the patch of each.
+    - `patches`: their names and types.
+    - `thickness`: that of a wedge is at y = 1.
     """
     sides: dict[tuple[int, int], list[tuple[int, int, int]]] = {}
     for number, cell in enumerate(cells):
@@ -175,6 +163,18 @@ class Case:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(header(kind, path.name) + text_of(entries))
 
+    def write_mesh(self, mesh: Any, openings: Sequence[str], thickness: float | None) -> None:
+        """Write a mesh of clvoro, with patches that are no walls, and as `clvoro.load` reads it."""
+        folder = self.folder / "constant" / "polyMesh"
+        mesh.to_openfoam(folder, types=dict.fromkeys(openings, "patch"), thickness=thickness)
+        mesh.save(folder / "clvoro.npz")
+
+    def plot_speed(self, **options: Any) -> Any:
+        """Draw the latest mesh of clvoro colored by the speed; `options` are those of `Diagram.plot`."""
+        known = FoamCase(self.folder)
+        mesh = clvoro.load(known.mesh_folder(known.latest()) / "clvoro.npz")
+        return mesh.plot(np.linalg.norm(self.field("U", len(mesh)), axis=1), label="speed", **options)
+
     def write_start(
         self,
         velocity: Mapping[str, Any],
@@ -220,13 +220,7 @@ class Case:
         self.write("system/controlDict", {**times, "writeInterval": control["endTime"], **control})
 
     def run(self, *program: str) -> None:
-        """Run a program of OpenFOAM.
-
-        Raises
-        ------
-        InputError, ClvoroError
-            If it is not installed, or fails.
-        """
+        """Run a program of OpenFOAM."""
         FoamCase(self.folder).run(" ".join(program), self.folder / f"log.{program[0]}")
 
     def table(self, function: str, file: str) -> dict[str, np.ndarray]:

@@ -10,9 +10,11 @@ from __future__ import annotations
 import math
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from itertools import product
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -32,6 +34,25 @@ class MissingPeerError(Exception):
     """A peer is not installed. The message says what to install."""
 
 
+@contextmanager
+def gmsh_with(**options: float) -> Iterator[Any]:
+    """Yield Gmsh in one thread, with `options` for its meshes: sizes are those of fields, or those given."""
+    try:
+        import gmsh
+    except (ModuleNotFoundError, OSError) as error:
+        raise MissingPeerError(f"gmsh (pip install gmsh): {error}") from error
+    gmsh.initialize(interruptible=False)
+    try:
+        from_others = ("MeshSizeFromPoints", "MeshSizeFromCurvature", "MeshSizeExtendFromBoundary")
+        for name, value in {**dict.fromkeys(from_others, 0), **options}.items():
+            gmsh.option.setNumber(f"Mesh.{name}", value)
+        gmsh.option.setNumber("General.Terminal", 0)
+        gmsh.option.setNumber("General.NumThreads", 1)
+        yield gmsh
+    finally:
+        gmsh.finalize()
+
+
 def grid(domain: clvoro.Box, counts: np.ndarray) -> np.ndarray:
     """Return the points (n, d) of a grid over the box, walls included."""
     axes = [np.linspace(a, b, k) for a, b, k in zip(domain.lower, domain.upper, counts, strict=True)]
@@ -43,10 +64,6 @@ def vertices_gmsh(domain: clvoro.Box, size: sizing.Field, edge: float) -> tuple[
 
     "Frontal-Delaunay" in 2D, "HXT" in 3D.
     """
-    try:
-        import gmsh
-    except (ModuleNotFoundError, OSError) as error:
-        raise MissingPeerError(f"gmsh (pip install gmsh): {error}") from error
     d, extent = domain.dim, np.array(domain.extent)
     least = np.asarray(size(grid(domain, np.full(d, 64)))).min()
     counts = np.clip(np.ceil(FINENESS * extent / least).astype(int), 2, MOST_POINTS[d])
@@ -58,19 +75,7 @@ def vertices_gmsh(domain: clvoro.Box, size: sizing.Field, edge: float) -> tuple[
         numbers = np.append(counts, [1] * flat).astype(np.int32)
         file.write_bytes(b"".join(a.astype(float).tobytes() for a in header) + numbers.tobytes() + values.tobytes())
         start = time.process_time()
-        gmsh.initialize(interruptible=False)
-        try:
-            for name, value in (
-                ("General.Terminal", 0),
-                ("General.NumThreads", 1),
-                ("Mesh.Algorithm", 6),
-                ("Mesh.Algorithm3D", 10),
-                ("Mesh.MeshSizeFromPoints", 0),
-                ("Mesh.MeshSizeFromCurvature", 0),
-                ("Mesh.MeshSizeExtendFromBoundary", 0),
-            ):
-                gmsh.option.setNumber(name, value)
-            gmsh.model.add("box")
+        with gmsh_with(Algorithm=6, Algorithm3D=10) as gmsh:
             if d == 2:
                 gmsh.model.occ.addRectangle(*domain.lower, 0, *extent)
             else:
@@ -83,8 +88,6 @@ def vertices_gmsh(domain: clvoro.Box, size: sizing.Field, edge: float) -> tuple[
             gmsh.model.mesh.generate(d)
             seconds = time.process_time() - start
             _, nodes, _ = gmsh.model.mesh.getNodes()
-        finally:
-            gmsh.finalize()
     return np.clip(nodes.reshape(-1, 3)[:, :d], domain.lower, domain.upper), seconds
 
 

@@ -30,18 +30,11 @@ def unit(x: np.ndarray) -> np.ndarray:
 class Mesh:
     """The C grid of a file; n cells, m edges, v vertices. Lengths in the unit of the radius.
 
-    Attributes
-    ----------
-    points, corners, crossings : (n, 3), (v, 3) and (m, 3) float arrays
-        Unit vectors: generators, vertices, and middles of the arcs between two generators, where these cross the great
-        circles of the faces.
-    edge_cells, edge_vertices : (m, 2) int arrays
-    dc, dv : (m,) float arrays
-        Arc between the generators, and length of the face.
-    kites : (v, n) sparse
-        The area that a vertex and a cell share.
-    tangential : (m, m) sparse
-        From normal to tangential components of a field on edges (T09).
+    - `points` (n, 3), `corners` (v, 3), `crossings` (m, 3): unit vectors of generators, vertices, and middles of arcs
+      between two generators, where these cross the great circles of the faces.
+    - `dc`, `dv` (m,): arc between the generators, and length of the face.
+    - `kites` (v, n): the area that a vertex and a cell share.
+    - `tangential` (m, m): from normal to tangential components of a field on edges (T09).
     """
 
     points: np.ndarray
@@ -108,24 +101,11 @@ def sparse_matrix(values: np.ndarray, rows: np.ndarray, columns: np.ndarray, *sh
 class Operators:
     """The discrete operators on a mesh of n cells, m edges and v vertices, as sparse matrices.
 
-    Attributes
-    ----------
-    div : (n, m)
-        Divergence in cells of a field normal to faces.
-    grad : (m, n)
-        Gradient along the normal.
-    curl : (v, m)
-        Vorticity on vertices.
-    tangential : (m, m)
-        Tangential component.
-    kinetic : (n, m)
-        Kinetic energy per mass in cells, of squared normal velocities.
-    cell_to_edge, vertex_to_edge : (m, n), (m, v)
-        Means of two.
-    cell_to_vertex, vertex_to_cell : (v, n), (n, v)
-        Means weighted with kites.
-    along : (m, v)
-        Gradient along the tangent.
+    - `div` (n, m): divergence in cells of a field normal to faces; `grad` (m, n): gradient along the normal.
+    - `curl` (v, m): vorticity on vertices; `along` (m, v): gradient along the tangent.
+    - `tangential` (m, m): tangential component.
+    - `kinetic` (n, m): kinetic energy per mass in cells, of squared normal velocities.
+    - `cell_to_edge`, `vertex_to_edge`: means of two; `cell_to_vertex`, `vertex_to_cell`: means weighted with kites.
     """
 
     def __init__(self, mesh: Mesh) -> None:
@@ -147,17 +127,9 @@ class Operators:
 class ShallowWater:
     """The shallow-water equations in vector-invariant form: R10, in the form that conserves energy.
 
-    Parameters
-    ----------
-    mesh : Mesh
-    gravity : float
-    coriolis : (v,) float array
-        Coriolis parameter f on vertices.
-    bottom : (n,) float array
-        Height of the bottom in cells.
-    upwinding : float
-        Time in units of the step by which potential vorticity is taken from upstream (the anticipated potential
-        vorticity method of R10 has 1/2); 0: none, energy is conserved.
+    - `coriolis` (v,): Coriolis parameter f on vertices; `bottom` (n,): height of the bottom in cells.
+    - `upwinding`: time in units of the step by which potential vorticity is taken from upstream (the anticipated
+      potential vorticity method of R10 has 1/2); 0: none, energy is conserved.
     """
 
     def __init__(

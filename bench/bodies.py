@@ -42,7 +42,6 @@ from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
 
 import clvoro
 from clvoro import foam, sizing
-from clvoro.foam.case import FoamCase
 from clvoro.geometry.domain import Domain
 
 GOALS = {"forces": foam.FieldSizes(forces="body"), "velocity": foam.FieldSizes()}
@@ -54,40 +53,19 @@ WEDGE = 0.1
 
 @dataclass(frozen=True)
 class Flow:
-    """A body in a stream of speed 1.
+    """A body in a stream of speed 1."""
 
-    Attributes
-    ----------
-    domain : callable
-        Its boundaries are inlet, outlet, sides and body.
-    viscosity, area : float
-        Area of the coefficient of drag.
-    thickness : float or None
-        Of the layer of cells, in 2D.
-    slope : float
-        Growth of the sizes that are graded by hand, per distance from the body.
-    drag : float
-        The reference, by --reference.
-    lines : callable
-        Returns the body and the box as complex lines, and the map between the plane of the flow and theirs.
-    cells : dict of str to str
-        Numbers of cells by kind of mesh.
-    window : tuple
-        Part of a picture.
-    reach : float
-        Distance from the axis up to which errors of the velocity count.
-    """
-
-    domain: Callable[[], Domain]
+    domain: Callable[[], Domain]  # with the boundaries inlet, outlet, sides and body
     viscosity: float
-    area: float
-    thickness: float | None
-    slope: float
-    drag: float
+    area: float  # of the coefficient of drag
+    thickness: float | None  # of the layer of cells, in 2D
+    slope: float  # growth of the sizes that are graded by hand, per distance from the body
+    drag: float  # the reference, by --reference
     lines: Callable[[], tuple[np.ndarray, np.ndarray, Callable[[np.ndarray], np.ndarray]]]
-    cells: dict[str, str]
-    window: tuple[tuple[float, float], tuple[float, float]]
-    reach: float
+    """Returns the body and the box as complex lines, and the map between the plane of the flow and theirs."""
+    cells: dict[str, str]  # by kind of mesh
+    window: tuple[tuple[float, float], tuple[float, float]]  # of a picture
+    reach: float  # distance from the axis up to which errors of the velocity count
 
 
 def around_airfoil() -> clvoro.Polygon:
@@ -274,9 +252,7 @@ def solve(
     if kind in ("graded", "wake"):
         size = graded(flow, domain, n, kind == "wake")
     made = adapter.run(domain, size, n_cells=count, seed=seed)
-    folder = case.folder / "constant" / "polyMesh"
-    made.to_openfoam(folder, types=dict.fromkeys(("inlet", "outlet", "sides"), "patch"), thickness=flow.thickness)
-    made.save(folder / "clvoro.npz")
+    case.write_mesh(made, ("inlet", "outlet", "sides"), flow.thickness)
     write_case(case, flow)
     if kind == "adapted":
         options: dict[str, Any] = {"sizes": goal, "interval": STEPS, "pictures": False, "adapter": adapter}
@@ -289,13 +265,8 @@ def solve(
 class Reference:
     """The velocity on a fine mesh, against which others are measured.
 
-    Attributes
-    ----------
-    at : (n, d) ndarray
-        Centroids of its cells; around the sphere each is turned about the axis by several angles.
-    weight : (n,) ndarray
-        Their volumes.
-    velocity : (n, d) ndarray
+    `velocity` (n, d) is that `at` the centroids of its cells, with their volumes as `weight`; around the sphere each is
+    turned about the axis by several angles.
     """
 
     def __init__(self, case: Case, flow: Flow) -> None:
@@ -351,11 +322,8 @@ def draw(records: list[dict[str, Any]], case: Case, flow: Flow, path: Path) -> N
         left.loglog([statistics.median(row["cells"]) for row in rows], errors, "o-", label=kind)
     left.set(xlabel="cells", ylabel=f"error of the {'drag' if shown == 'error' else 'velocity'}, %")
     left.legend(frameon=False)
-    known = FoamCase(case.folder)
-    mesh = clvoro.load(known.mesh_folder(known.latest()) / "clvoro.npz")
-    speed = np.linalg.norm(case.field("U", len(mesh)), axis=1)
     options = {"view": "slice", "normal": "z"} if flow.thickness is None else {"view": "cells"}
-    mesh.plot(speed, ax=right, window=flow.window, label="speed", title=f"adapted, {len(mesh):,} cells", **options)
+    case.plot_speed(ax=right, window=flow.window, title=f"adapted, {len(case.latest_mesh()):,} cells", **options)
     figure.savefig(path, dpi=130)
     plt.close(figure)
 
@@ -371,7 +339,6 @@ COLUMNS = {
 
 
 def main() -> None:
-    """Run the bench."""
     options_of = parser(__doc__)
     options_of.add_argument("--flow", choices=tuple(FLOWS), default="airfoil")
     for kind in ("uniform", "graded", "wake", "adapted"):

@@ -188,7 +188,6 @@ COLUMNS = {
 
 
 def main() -> None:
-    """Run the bench."""
     made = parser(__doc__)
     made.add_argument("--only", default="", metavar="NAMES", help=", ".join(PLACES))
     made.add_argument("--runs", default="default", metavar="NAMES", help=", ".join(RUNS))

@@ -59,17 +59,7 @@ AT_LEAST = ("mean_quality", "min_quality", "mean_quality_all")
 class Row:
     """A run, and its targets.
 
-    Attributes
-    ----------
-    name : str
-        As `--rows` takes it.
-    fields : tuple of str
-    arguments : dict
-        Of `Adapter.run`.
-    targets : dict
-        Figure -> bound.
-    on_coast : bool
-        In a lake in place of a box.
+    Its name for `--rows`, arguments of `Adapter.run`, and bounds of figures; perhaps in a lake in place of a box.
     """
 
     name: str

@@ -41,6 +41,7 @@ from typing import Any
 import numpy as np
 from _common import Report, counts, heading, make_adapter, parser, spread
 from _openfoam import Case, Mesh, forces_on, header, nonuniform, require, text_of, write_prisms
+from _remeshers import MissingPeerError, gmsh_with
 
 import clvoro
 from clvoro.foam.case import FoamCase
@@ -57,10 +58,6 @@ RANGES = {"drag": (3.22, 3.24), "lift": (0.99, 1.01), "strouhal": (0.295, 0.305)
 COARSE = 2000
 """Cells of the first mesh at Re 100, if it is followed."""
 Size = Callable[[np.ndarray], np.ndarray]
-
-
-class MissingPeerError(Exception):
-    """A mesher is not installed. The message says what to install."""
 
 
 # Sizes.
@@ -109,49 +106,32 @@ def scaled(size: Size, n_cells: float) -> Size:
 # Meshers: each writes the polyMesh of a case.
 
 
-def mesh_clvoro(layers: bool, effort: str, mirrored: bool = False) -> Callable[..., None]:
+def mesh_clvoro(kind: str, effort: str = "default") -> Callable[..., None]:
+    """Return a mesher of cells of one kind: plain, with layers, mirrored, uniform, or of a newcomer."""
+
     def mesh(case: Case, adapter: clvoro.Adapter, size: Size, n_cells: int, seed: int) -> None:
-        cylinder = clvoro.curves.circle(CENTER, RADIUS, name="cylinder")
-        domain = clvoro.Polygon(
-            [(0, 0), (LENGTH, 0), (LENGTH, HEIGHT), (0, HEIGHT)],
-            [cylinder],
-            names={"walls": [0, 2], "outlet": 1, "inlet": 3},
-        )
-        field, rows = scaled(size, n_cells), []
-        if layers:
+        names: dict[str, Any] = {"walls": [0, 2], "outlet": 1, "inlet": 3}
+        cylinder: Any = clvoro.curves.circle(CENTER, RADIUS, name="cylinder")
+        if kind in ("uniform", "newcomer"):  # 360 straight edges
+            angle, names["cylinder"] = np.linspace(0, 2 * np.pi, 360, endpoint=False), range(4, 364)
+            cylinder = np.column_stack([np.cos(angle), np.sin(angle)]) * RADIUS + CENTER
+        whole = clvoro.Polygon([(0, 0), (LENGTH, 0), (LENGTH, HEIGHT), (0, HEIGHT)], [cylinder], names=names)
+        field: Any = scaled(size, n_cells)
+        if kind == "uniform":
+            field = math.sqrt(whole.measure / n_cells)
+        elif kind == "newcomer":
+            field = clvoro.sizing.Distance(whole.boundary("cylinder"), h_min=0.002, slope=0.06, h_max=0.02)
+        options: dict[str, Any] = {"effort": effort, "seed": seed}
+        if kind in ("layers", "mirrored"):
             h = float(field(np.array([[CENTER[0] - RADIUS, CENTER[1]]]))[0])
-            rows = [clvoro.Layers(0.7 * h, 4, 1.15, spacing=1.4 * h, edges="cylinder")]
+            options["layers"] = [clvoro.Layers(0.7 * h, 4, 1.15, spacing=1.4 * h, edges="cylinder")]
         made: clvoro.Result | clvoro.Diagram
-        if mirrored:
-            lower = adapter.run(_lower_part(), field, effort=effort, layers=rows, seed=seed)
-            made = adapter.diagram(domain, _with_mirror_images(lower.points))
+        if kind == "mirrored":
+            lower = adapter.run(_lower_part(), field, **options)
+            made = adapter.diagram(whole, _with_mirror_images(lower.points))
         else:
-            made = adapter.run(domain, field, n_cells=n_cells, effort=effort, layers=rows, seed=seed)
-        types = {name: "patch" for name, kind in PATCHES.items() if kind == "patch"}
-        made.to_openfoam(case.folder / "constant" / "polyMesh", types=types, thickness=THICKNESS)
-
-    return mesh
-
-
-def _newcomer() -> clvoro.Polygon:
-    """Return the channel with a cylinder of 360 straight edges."""
-    angle = np.linspace(0, 2 * np.pi, 360, endpoint=False)
-    ring = np.column_stack([np.cos(angle), np.sin(angle)]) * RADIUS + CENTER
-    names = {"walls": [0, 2], "outlet": 1, "inlet": 3, "cylinder": range(4, 364)}
-    return clvoro.Polygon([(0, 0), (LENGTH, 0), (LENGTH, HEIGHT), (0, HEIGHT)], [ring], names=names)
-
-
-def mesh_newcomer(uniform: bool) -> Callable[..., None]:
-    def mesh(case: Case, adapter: clvoro.Adapter, size: Size, n_cells: int, seed: int) -> None:
-        domain = _newcomer()
-        field: object = math.sqrt(domain.measure / n_cells)
-        if not uniform:
-            ring = clvoro.sizing.ClosedPolyline(domain.vertices[4:])
-            field = clvoro.sizing.Distance(ring, h_min=0.002, slope=0.06, h_max=0.02)
-        made = adapter.run(domain, field, n_cells=n_cells, seed=seed)
-        folder = case.folder / "constant" / "polyMesh"
-        made.to_openfoam(folder, types={"inlet": "patch", "outlet": "patch"}, thickness=THICKNESS)
-        made.save(folder / "clvoro.npz")
+            made = adapter.run(whole, field, n_cells=n_cells, **options)
+        case.write_mesh(made, ("inlet", "outlet"), THICKNESS)
 
     return mesh
 
@@ -226,14 +206,10 @@ def _with_mirror_images(points: np.ndarray) -> np.ndarray:
 
 def mesh_gmsh(quadrangles: bool) -> Callable[..., None]:
     def mesh(case: Case, _: clvoro.Adapter, size: Size, n_cells: int, seed: int) -> None:
-        try:
-            import gmsh
-        except (ModuleNotFoundError, OSError) as error:
-            raise MissingPeerError(f"gmsh (pip install gmsh): {error}") from error
         # An equilateral triangle of area h^2 has edges of 1.52 h.
         factor, field = (1.0 if quadrangles else 1.52), scaled(size, n_cells)
         for _ in range(4):
-            points, cells = _gmsh(gmsh, field, factor, quadrangles)
+            points, cells = _gmsh(field, factor, quadrangles)
             if abs(len(cells) / n_cells - 1) < 0.01:
                 break
             factor *= math.sqrt(len(cells) / n_cells)
@@ -242,22 +218,9 @@ def mesh_gmsh(quadrangles: bool) -> Callable[..., None]:
     return mesh
 
 
-def _gmsh(gmsh: Any, field: Size, factor: float, quadrangles: bool) -> tuple[np.ndarray, list[np.ndarray]]:
+def _gmsh(field: Size, factor: float, quadrangles: bool) -> tuple[np.ndarray, list[np.ndarray]]:
     """Return the points and cells of a mesh of the channel, with edges `factor` times `field`."""
-    gmsh.initialize(interruptible=False)
-    try:
-        options = {
-            "General.Terminal": 0,
-            "General.NumThreads": 1,
-            "Mesh.Algorithm": 8 if quadrangles else 6,
-            "Mesh.MeshSizeFromPoints": 0,
-            "Mesh.MeshSizeFromCurvature": 0,
-            "Mesh.MeshSizeExtendFromBoundary": 0,
-            "Mesh.RecombineAll": int(quadrangles),
-        }
-        for name, value in options.items():
-            gmsh.option.setNumber(name, value)
-        gmsh.model.add("channel")
+    with gmsh_with(Algorithm=8 if quadrangles else 6, RecombineAll=int(quadrangles)) as gmsh:
         channel = gmsh.model.occ.addRectangle(0, 0, 0, LENGTH, HEIGHT)
         disk = gmsh.model.occ.addDisk(*CENTER, 0, RADIUS, RADIUS)
         gmsh.model.occ.cut([(2, channel)], [(2, disk)])
@@ -266,8 +229,6 @@ def _gmsh(gmsh: Any, field: Size, factor: float, quadrangles: bool) -> tuple[np.
         gmsh.model.mesh.generate(2)
         tags, coordinates, _ = gmsh.model.mesh.getNodes()
         kinds, _, nodes = gmsh.model.mesh.getElements(2)
-    finally:
-        gmsh.finalize()
     number = np.zeros(int(tags.max()) + 1, int)
     number[tags.astype(int)] = np.arange(len(tags))
     points = coordinates.reshape(-1, 3)[:, :2]
@@ -335,16 +296,16 @@ def mesh_blocks(case: Case, _: clvoro.Adapter, size: Size, n_cells: int, seed: i
 
 
 MESHERS: dict[str, Callable[..., None]] = {
-    "clvoro": mesh_clvoro(False, "default"),
-    "clvoro, best": mesh_clvoro(False, "best"),
-    "clvoro, layers": mesh_clvoro(True, "best"),
-    "clvoro, layers, mirrored": mesh_clvoro(True, "best", mirrored=True),
+    "clvoro": mesh_clvoro("plain"),
+    "clvoro, best": mesh_clvoro("plain", "best"),
+    "clvoro, layers": mesh_clvoro("layers", "best"),
+    "clvoro, layers, mirrored": mesh_clvoro("mirrored", "best"),
     "Gmsh triangles": mesh_gmsh(False),
     "Gmsh quadrangles": mesh_gmsh(True),
     "blockMesh": mesh_blocks,
-    "uniform": mesh_newcomer(True),
-    "newcomer": mesh_newcomer(False),
-    **dict.fromkeys(FOLLOWED, mesh_newcomer(False)),
+    "uniform": mesh_clvoro("uniform"),
+    "newcomer": mesh_clvoro("newcomer"),
+    **dict.fromkeys(FOLLOWED, mesh_clvoro("newcomer")),
 }
 
 
@@ -560,32 +521,6 @@ def follow_vortices(case: Case, adapter: clvoro.Adapter, mesh: Mesh, n_cells: in
     return {**shedding_of(case, end), "divergence": divergence, **seconds_of(rows)}
 
 
-def picture(case: Case, mesh: Mesh, path: Path, title: str) -> None:
-    """Draw the mesh near the cylinder, colored by speed."""
-    import matplotlib as mpl
-
-    mpl.use("Agg")
-    from matplotlib import pyplot as plt
-    from matplotlib.collections import PolyCollection
-
-    speed = np.linalg.norm(case.field("U", len(mesh)), axis=1)
-    back = mesh.patch("back")
-    polygons = mesh.polygons(back[np.argsort(mesh.owner[back])])
-    figure, (whole, near) = plt.subplots(2, 1, figsize=(9, 7), height_ratios=(2, 5))
-    for axes in (whole, near):
-        edge = "none" if axes is whole else "0.25"
-        drawn = PolyCollection(polygons, array=speed, edgecolor=edge, linewidth=0.3, cmap="viridis")
-        if axes is whole:
-            drawn.set_edgecolor("face")
-        axes.add_collection(drawn)
-        axes.set_aspect("equal")
-    whole.set(xlim=(0, LENGTH), ylim=(0, HEIGHT), title=f"{title}, {len(mesh):,} cells: speed")
-    near.set(xlim=(0.06, 0.5), ylim=(0.08, 0.32))
-    figure.tight_layout()
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
-
-
 # Tables.
 
 
@@ -630,7 +565,6 @@ def meshing_share(row: dict[str, Any]) -> np.ndarray:
 
 
 def main() -> None:
-    """Run the bench."""
     options_of = parser(__doc__)
     options_of.add_argument("--reynolds", type=int, choices=(20, 100), default=20)
     options_of.add_argument("--cells", type=counts, default=None, metavar="LIST")
@@ -684,10 +618,13 @@ def main() -> None:
                     found["seconds"] = time.perf_counter() - start
                     for key, value in found.items():
                         kept.setdefault(key, []).append(value)
-                    if options.pictures and not sample:
+                    if options.pictures and not sample and "clvoro" in mesher:
                         options.pictures.mkdir(parents=True, exist_ok=True)
-                        name = f"{mesher.replace(', ', '_').replace(' ', '_')}_{re_}_{n}.png"
-                        picture(case, mesh, options.pictures / name, mesher)
+                        name = f"{mesher.replace(', ', '_')}_{re_}_{n}.png"
+                        figure = case.plot_speed(
+                            window=((0.06, 0.08), (0.5, 0.32)), title=f"{mesher}, {len(mesh):,} cells"
+                        )
+                        figure.savefig(options.pictures / name, dpi=110)
             if kept:
                 report.add({**record, **kept}, f"{mesher}, {n}")
     ranges = ", ".join(f"{name} {low} to {high}" for name, (low, high) in RANGES.items())

@@ -40,7 +40,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from _common import Report, best, clock_of, counts, heading, make_adapter, names, parser, shown
+from _common import CUBE, SQUARE, Report, best, clock_of, counts, heading, make_adapter, names, parser, shown
 
 import clvoro
 from clvoro.opencl.engine import Engine
@@ -49,8 +49,6 @@ from clvoro.opencl.profile import Profile, profiled_queue
 from clvoro.tessellation.stages import TessellationStages
 from clvoro.tessellation.tessellator import Tessellator
 
-BOX = clvoro.Box((0.0, 0.0), (1.0, 1.0))
-CUBE = clvoro.Box((0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
 SEED = 7919
 RATIO = 1e4
 RATIO_3D = 1e3
@@ -153,7 +151,7 @@ class Diagrams:
     """Diagrams on one queue, over generators in the order of their bins."""
 
     def __init__(self, engine: Engine, points: np.ndarray) -> None:
-        self.n, self.box = len(points), BOX if engine.dim == 2 else CUBE
+        self.n, self.box = len(points), SQUARE if engine.dim == 2 else CUBE
         self.stages = TessellationStages(engine)
         self.tessellator = Tessellator(self.stages, self.box)
         self.given = engine.upload(points)

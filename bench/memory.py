@@ -155,7 +155,6 @@ OTHERS = {"resumed": resumed, "transfer": transferred}
 
 
 def main() -> None:
-    """Run the bench."""
     options_of = parser(__doc__)
     options_of.add_argument("--sizes", type=counts, default=[100_000], help="cells (1e5)")
     options_of.add_argument("--kinds", type=names, default=["F2", "S1"], help="first words of kinds of runs, or 'all'")

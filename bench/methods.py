@@ -74,20 +74,19 @@ class Way:
     color: str
     arguments: dict[str, Any] | None = None
 
+    @property
+    def style(self) -> dict[str, Any]:
+        """How it is drawn; hollow if its figures are given."""
+        face = "none" if self.source == "given" else self.color
+        return {"linestyle": "", "marker": self.marker, "color": self.color, "markerfacecolor": face}
+
 
 def repeated(method: str, **more: Any) -> dict[str, Any]:
     return {"method": method, "max_steps": REPEATED, "options": clvoro.PaperOptions(tol=0), **more}
 
 
-GRAY, BLUE, SKY, ORANGE, GREEN, PINK, RED = (
-    "#555555",
-    "#0072B2",
-    "#56B4E9",
-    "#E69F00",
-    "#009E73",
-    "#CC79A7",
-    "#D55E00",
-)
+GRAY, BLUE, SKY, ORANGE = "#555555", "#0072B2", "#56B4E9", "#E69F00"
+GREEN, PINK, RED = "#009E73", "#CC79A7", "#D55E00"
 WAYS = (
     Way("insertion and deletion", "2.3.1", "P", ORANGE),
     Way("weighted-lloyd", "2.3.2", "v", SKY, repeated("weighted-lloyd")),
@@ -152,12 +151,7 @@ def judge(diagram: clvoro.Diagram, h: np.ndarray) -> dict[str, float]:
 def measure(
     adapter: clvoro.Adapter, way: Way, name: str, factor: float = 1.0
 ) -> tuple[dict[str, Any], clvoro.Diagram | clvoro.Result]:
-    """Return the record of one method on one field, and its mesh.
-
-    Raises
-    ------
-    MissingPeerError
-    """
+    """Return the record of one method on one field, and its mesh."""
     domain, size = domain_of("F1" if name == "paper" else name), field_of(name) * factor
     record: dict[str, Any] = {"field": name, "method": way.name, "source": way.source, "scale": factor}
     if way.arguments is not None:
@@ -281,18 +275,8 @@ def draw(records: list[dict[str, Any]], meshes: dict[str, Any], path: Path) -> N
                 for r in records:
                     if (r["method"], r["field"], r["scale"]) != (way.name, name, 1):
                         continue
-                    hollow = way.source == "given"
-                    ax.scatter(
-                        max(r["mean_error"], LEFT),
-                        1 - r["mean_quality"],
-                        marker=way.marker,
-                        s=34,
-                        zorder=3,
-                        linewidth=0.8,
-                        color=None if hollow else way.color,
-                        facecolor="none" if hollow else None,
-                        edgecolor=way.color if hollow else None,
-                    )
+                    at = max(r["mean_error"], LEFT), 1 - r["mean_quality"]
+                    ax.plot(*at, zorder=3, markersize=5.8, markeredgewidth=0.8, **way.style)
             solid = name.startswith("S")
             ax.set(xscale="log", yscale="linear" if solid else "log", title=TITLES[name], xlim=(0.7 * LEFT, 2))
             ax.set_ylim(*((0.2, 0.5) if solid else (0.002, 0.4)))
@@ -304,20 +288,8 @@ def draw(records: list[dict[str, Any]], meshes: dict[str, Any], path: Path) -> N
             ax.set_axisbelow(True)
         axes[7].set_axis_off()
         present = {r["method"] for r in records}
-        handles = [
-            Line2D(
-                [],
-                [],
-                linestyle="",
-                marker=w.marker,
-                markersize=5,
-                color=w.color,
-                label=w.name,
-                markerfacecolor="none" if w.source == "given" else w.color,
-            )
-            for w in WAYS
-            if w.name in present and w.name != "JIGSAW, 64 passes"
-        ]
+        shown = [w for w in WAYS if w.name in present and w.name != "JIGSAW, 64 passes"]
+        handles = [Line2D([], [], markersize=5, label=w.name, **w.style) for w in shown]
         axes[7].legend(handles=handles, loc="center", frameon=False, fontsize=6.8, labelspacing=0.35)
         for k in (0, 4):
             axes[k].set_ylabel("1 − mean quality Q [–]", fontsize=8)

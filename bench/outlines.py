@@ -240,7 +240,6 @@ COLUMNS = {
 
 
 def main() -> None:
-    """Run the bench."""
     options_of = parser(__doc__)
     options_of.add_argument("--kinds", default=",".join(KINDS), metavar="NAMES")
     options_of.add_argument("--sizes", default="0.5,1,2,3", metavar="PIXELS")

@@ -29,15 +29,8 @@ METHODS = ("lloyd", "poisson", "coupled")
 class Claim:
     """One sentence of the paper.
 
-    Attributes
-    ----------
-    text : str
-    measure : function
-        Takes the results of the three methods from one start; returns named numbers.
-    holds : function
-        Takes these numbers; whether the claim holds for that start.
-    criterion : str
-        What `holds` asks for, in words.
+    `measure` takes the results of the three methods from one start, and returns named numbers; `holds` takes these, and
+    says whether the claim holds for that start. `criterion` has it in words.
     """
 
     text: str

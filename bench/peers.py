@@ -251,14 +251,7 @@ def launched(name: str, which: str, n: int, dim: int, options: argparse.Namespac
 
 
 class Truth:
-    """Volumes of sampled cells of `points`, each intersected from the planes to all points that may bound it.
-
-    Parameters
-    ----------
-    points : (n, dim) float
-    periodic : bool
-    samples : int
-    """
+    """Volumes of sampled cells of `points`, each intersected from the planes to all points that may bound it."""
 
     def __init__(self, points: Array, periodic: bool, samples: int) -> None:
         n, dim = points.shape

@@ -25,7 +25,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from _common import Report, device_name, heading, parser
+from _common import BOX, CUBE, PERIODIC, PERIODIC_CUBE, SQUARE, Report, device_name, heading, parser
 
 import clvoro
 from clvoro import sizing
@@ -120,11 +120,6 @@ def resumed(domain: Any, size: Any, rows: int, **options: Any) -> Run:
 
 # Domains and sizes.
 
-BOX = clvoro.Box((0, 0), (2.5, 1.5))
-SQUARE = clvoro.Box((0, 0), (1, 1))
-CUBE = clvoro.Box((0, 0, 0), (1, 1, 1))
-PERIODIC = clvoro.Box((0, 0), (1, 1), periodic=True)
-PERIODIC_CUBE = clvoro.Box((0, 0, 0), (1, 1, 1), periodic=True)
 CHANNEL = clvoro.Box((0, 0), (2, 1), periodic=(True, False))
 CHANNEL_3D = clvoro.Box((0, 0, 0), (1, 1, 1), periodic=(True, False, True))
 

@@ -194,7 +194,6 @@ COLUMNS = {
 
 
 def main() -> None:
-    """Run the bench."""
     made = parser(__doc__)
     made.add_argument("--only", type=names, default=list(SHEETS), help=", ".join(SHEETS))
     made.add_argument("--effort", default="default", choices=("fast", "default", "best"))

@@ -9,11 +9,8 @@ skewness, the number of concave cells, the volume of all cells over that of the 
 
 --runs is a list of efforts and "exact". With `--worst` a row has the worst figures of all runs and seeds, and how many
 are accepted with at most 20 degrees of non-orthogonality (mean 3), skewness 2 and no concave cell: `--runs
-default,best,exact --seeds 3 --worst`. `--speed NUMBERS` compares processor times for so many cells in a cube as a
-box, as a solid, and around a wavy body of 82,000 triangles in it, with the default effort: those of the run, of the
-mesh with its faces, and of the mesh for solvers. Memory is the most up to then of the whole process. `--domains`
-chooses some of the three. `--order SIZES` compares volume and wall area of a ball, a torus and a cylinder with those of
-their surface, and its distance from the vertices of walls with h^2 times the curvature.
+default,best,exact --seeds 3 --worst`. `--order SIZES` compares volume and wall area of a ball, a torus and a cylinder
+with those of their surface, and its distance from the vertices of walls with h^2 times the curvature.
 
 With `--booleans N` the solids are N random booleans of boxes, balls and cylinders, from number `--first` on, or those
 whose numbers `--only` lists, with about `--cells` cells each, in a process that may crash or hang. Each is accepted,
@@ -51,7 +48,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from _common import CUBE, Report, counts, heading, make_adapter, names, parser
+from _common import Report, counts, heading, make_adapter, names, parser
 from _openfoam import require
 from _solid_shapes import LAYERED, SHAPES, random_part, solid_of
 from _surface_scenes import SCENES
@@ -103,17 +100,6 @@ def worst_of(records: list[dict[str, Any]]) -> list[dict[str, Any]]:
         | {"good": sum(r["ok"] and all(round(r[key], 2) <= most for key, most in GOALS.items()) for r in rows)}
         for (solid, h), rows in groups.items()
     ]
-
-
-BODY_EDGE = 0.0172
-"""Length of triangles of a ball over its radius: they are 82,000."""
-
-
-def wavy_body() -> clvoro.Solid:
-    """Return a ball with waves, of 82,000 triangles."""
-    ball = clvoro.Solid.ball((0, 0, 0), 1, edge=BODY_EDGE).surface
-    waves = 1 + 0.1 * np.sin(5 * ball.vertices).prod(axis=1)
-    return clvoro.Solid(0.5 + 0.25 * waves[:, None] * ball.vertices, ball.triangles)
 
 
 def quotient(diagram: clvoro.Diagram) -> float:
@@ -416,59 +402,7 @@ def measure_all(options: argparse.Namespace) -> Report:
     return report
 
 
-SPEED_COLUMNS = {
-    "domain": lambda r: r["domain"],
-    "triangles": lambda r: r["triangles"],
-    "cells": lambda r: r["cells"],
-    "run, s": lambda r: f"{r['run']:.1f}",
-    "mesh, s": lambda r: f"{r['mesh']:.1f}",
-    "for solvers, s": lambda r: f"{r['solver']:.1f}",
-    "sum / box": lambda r: f"{r['ratio']:.2f}",
-    "peak memory, GB": lambda r: f"{r['memory']:.2f}",
-}
-
-
-DOMAINS: dict[str, Callable[[], Any]] = {
-    "box": lambda: CUBE,
-    "cube": lambda: clvoro.Solid.box((0, 0, 0), (1, 1, 1)),
-    "body": lambda: clvoro.Solid.outside(wavy_body(), CUBE),
-}
-"""Domains of which speeds are compared."""
 RUNS = (*EFFORTS, "exact")
-
-
-def measure_speed(adapter: clvoro.Adapter, n: int, chosen: list[str], report: Report) -> None:
-    """Add rows of processor times with `n` cells in a box, in the same cube as a solid, and around a body in it."""
-    begun: list[float] = []
-
-    def steps(status: Any) -> None:
-        begun[1:] = [time.process_time()]
-
-    base = 0.0
-    for name in chosen or DOMAINS:
-        domain = DOMAINS[name]()
-        adapter.run(domain, 0.2, "fast").diagram.faces.area.sum()  # builds the programs
-        begun[:] = [time.process_time()]
-        result = adapter.run(domain, (domain.measure / n) ** (1 / 3), callback=steps)
-        result.diagram.faces.area.sum()
-        middle = time.process_time()
-        result.diagram.solver_mesh().area.sum()
-        end = time.process_time()
-        base = base or end - begun[0]
-        row = {
-            "domain": name,
-            "triangles": len(getattr(domain, "patch", ())),
-            "cells": len(result.points),
-            "run": begun[1] - begun[0],
-            "mesh": middle - begun[1],
-            "solver": end - middle,
-            "ratio": (end - begun[0]) / base,
-            "memory": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20,
-        }
-        del result
-        report.add(row, f"{name}, {n}: {row['ratio']:.2f}")
-
-
 ORDER_COLUMNS = {
     **{name: COLUMNS[name] for name in ("solid", "run", "h", "cells", "mean e", "quotient")},
     "volume error": lambda r: f"{r['volume'] - 1:.1e}",
@@ -508,7 +442,6 @@ def settings_of(run: str) -> dict[str, Any]:
 
 
 def main() -> None:
-    """Run the bench."""
     options_of = parser(__doc__)
     options_of.add_argument("--only", default="", metavar="NAMES", help=", ".join(SHAPES))
     options_of.add_argument("--runs", default="default", metavar="NAMES", help="efforts, and exact")
@@ -523,28 +456,20 @@ def main() -> None:
     options_of.add_argument("--first", type=int, default=0, metavar="N", help="number of the first random solid")
     options_of.add_argument("--cells", type=int, default=1500, metavar="N", help="of each random solid, about")
     options_of.add_argument("--limit", type=float, default=600, metavar="SECONDS", help="processor time for each mesh")
-    options_of.add_argument("--speed", default="", metavar="NUMBERS", help="processor times of so many cells")
     options_of.add_argument("--keep", type=Path, metavar="FOLDER", help="keep the cases, with checkMesh.log")
     options_of.add_argument("--pictures", type=Path, metavar="FOLDER")
     options_of.add_argument("--order", default="", metavar="SIZES", help="errors of volume and area at these sizes")
     options_of.add_argument("--layers", default="", metavar="LAYERS", help="thickness / h:count:growth, as 0.5:5:1.3")
     options_of.add_argument("--surfaces", action="store_true", help="domains with surfaces inside")
-    options_of.add_argument("--domains", default="", metavar="NAMES", help=f"of --speed: {', '.join(DOMAINS)}")
     options = options_of.parse_args()
     shapes: Any = SCENES if options.surfaces else LAYERED if options.layers else SHAPES
     for what, given, known in (
         ("solid", () if options.booleans or options.files else names(options.only), shapes),
         ("resolution", names(options.resolutions), ("0", "1")),
         ("run", names(options.runs), RUNS),
-        ("domain", names(options.domains), DOMAINS),
     ):
         if unknown := [name for name in given if name not in known]:
             options_of.error(f"no {what} {', '.join(unknown)}; there are {', '.join(known)}")
-    if options.speed:
-        adapter, report = make_adapter(options), Report(options.json, SPEED_COLUMNS)
-        for n in names(options.speed):
-            measure_speed(adapter, round(float(n)), names(options.domains), report)
-        return report.finish(heading(adapter, "processor time of runs, and of meshes that are read with their faces"))
     require("checkMesh")
     adapter = make_adapter(options)
     report = measure_all(options)

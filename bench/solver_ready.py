@@ -98,7 +98,6 @@ COLUMNS = {
 
 
 def main() -> None:
-    """Run the bench."""
     options_of = parser(__doc__)
     options_of.add_argument("--only", default="", metavar="NAMES", help=", ".join(DOMAINS))
     options_of.add_argument("--effort", default="default,best", metavar="NAMES")

@@ -105,7 +105,6 @@ COLUMNS = {
 
 
 def main() -> None:
-    """Run the bench."""
     title, _, rest = (__doc__ or "").partition("\n")
     options_of = argparse.ArgumentParser(
         description=title, epilog=rest, formatter_class=argparse.RawDescriptionHelpFormatter
