@@ -32,6 +32,7 @@ _STEP = 2.0  # longest straight part of an outline, degrees of a great circle
 _WIDE_LABELS = 0.35
 """Additional width of the labels of degrees and of large sizes beside a map, inches."""
 _CENTER = (0.0, 25.0)  # of the picture of a uniform mesh
+_AREA = 0.5  # cosine of the angle from its middle within which a mesh is that of a limited area
 _STEPS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10, 15, 30, 60)  # of meridians and parallels, degrees
 _SCALES = {"110m": 40.0, "50m": 8.0, "10m": 0.0}
 """Scales of coastlines, and the smallest angle in degrees across a picture that has them."""
@@ -67,9 +68,10 @@ def plot_globe(
     center : (lon, lat), degrees, optional
         The point in the middle; with "plate" only the longitude counts. By default where the cells are smallest.
     across : float, optional
-        For "orthographic": angle in degrees that the picture spans, at most 180; by default the whole globe.
+        For "orthographic": angle in degrees that the picture spans, at most 180; by default the whole globe, or the
+        area of a mesh that covers less than a third of it, if there is no `center` either.
     window : ((lon, lat), (lon, lat)), optional
-        For "plate": lower left and upper right corner in degrees; by default the whole sphere.
+        For "plate": lower left and upper right corner in degrees; by default the whole sphere, or such an area.
     coasts : bool, optional
         Draw the coastlines of the Earth, if Natural Earth's data are on this computer: nothing is downloaded here.
         Cartopy's program ``cartopy_feature_download physical`` does that. By default on spheres as large as the Earth.
@@ -93,6 +95,8 @@ def plot_globe(
     paint = paint_of(result, color, label, limits)
     with styled():
         if ax is None:
+            if center is None and across is None and window is None:
+                center, across, window = _view_of_area(result, projection)
             if center is None and not (projection == "plate" and window is None):
                 center = default_center(result)
             ax = _new_map(projection, center, across, window, bool(paint.scheme.classes), title is not None)
@@ -171,6 +175,22 @@ def default_center(result: Result) -> tuple[float, float]:
     lonlat = directions(points[best].mean(axis=0, keepdims=True))[0]
     lon, lat = (5 * np.round(lonlat / 5) + 0.0).tolist()
     return lon, lat
+
+
+def _view_of_area(result: Result, projection: Any) -> tuple[Any, float | None, Any]:
+    """Return center, angle across and window that show a mesh of a limited area, else None for all."""
+    points = result.points / np.linalg.norm(result.points, axis=1)[:, None]
+    middle = points.mean(axis=0, keepdims=True)
+    least = float((points @ middle[0]).min() / np.linalg.norm(middle))
+    if least < _AREA or not isinstance(projection, str):
+        return None, None, None
+    (lon, lat), around = directions(middle)[0], directions(points)
+    east = (around[:, 0] - lon + 180) % 360 - 180
+    margin = 0.08 * np.degrees(np.arccos(least)) + 0.01
+    if projection == "orthographic":
+        return (lon, lat), 2 * (np.degrees(np.arccos(least)) + margin), None
+    south, north = np.clip([around[:, 1].min() - margin, around[:, 1].max() + margin], -90, 90)
+    return None, None, ((lon + east.min() - margin, south), (lon + east.max() + margin, north))
 
 
 def _new_map(projection: Any, center: Any, across: Any, window: Any, legend: bool, title: bool) -> Any:
