@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
 from os import PathLike
-from typing import Literal, NoReturn
+from typing import Any, Literal, NoReturn
 
 import numpy as np
 import pyopencl as cl
@@ -416,7 +416,7 @@ class Adapter:
         method: MethodName = "adaptive",
         n_cells: int | None = None,
         layers: Layers | Sequence[Layers] = (),
-        fixed: ArrayLike | None = None,
+        fixed: ArrayLike | PathLike[str] | Mapping[str, Any] | None = None,
         seed: int = 0,
         max_steps: int | None = None,
         options: MultilevelOptions | PaperOptions | None = None,
@@ -461,9 +461,10 @@ class Adapter:
             Rows of generators along walls of a box in 2D or a polygon. They do not move. In the result they follow
             `fixed` and the generators that a run places in concave corners. Beyond them the sizes grow gradually from
             the size of the layers; see `Layers`. Their cells count as having the right size.
-        fixed : (k, d) array of float, optional
+        fixed : (k, d) array of float, or points of shapely or GeoJSON, optional
             Generators that do not move, such as wells: rows 0 to k - 1 of the result, exactly at these positions. Their
             neighbors move until all have their sizes. Not for "transport" and moving meshes, which move all of them.
+            GeoJSON is a file, such as "wells.geojson", or a mapping.
         seed : int
             Seed of the random start.
         max_steps : int, optional
@@ -596,7 +597,7 @@ class Adapter:
         method: MethodName = "adaptive",
         n_cells: int | None = None,
         layers: Layers | Sequence[Layers] = (),
-        fixed: ArrayLike | None = None,
+        fixed: ArrayLike | PathLike[str] | Mapping[str, Any] | None = None,
         seed: int = 0,
         max_steps: int | None = None,
         options: MultilevelOptions | PaperOptions | None = None,

@@ -6,7 +6,8 @@ begins. Coarser levels do not have them, as they may be close together for the c
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from os import PathLike
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from ..arguments import FIRST_ROWS, check_points, coincident_pair, format_point,
 from ..errors import InputError, InputTypeError, MismatchWarning
 from ..geometry.domain import Domain
 from ..geometry.fixed_generators import FixedGenerators
+from ..geometry.geojson import geometries_of_geojson
 from ..mesh.diagram import Diagram
 from .tuning import AT_WALL, BEHIND_WALL, CANDIDATES, CLEARINGS, CLOSE, ON_WALL
 
@@ -31,8 +33,10 @@ def check_fixed(fixed: object, domain: Domain, real: np.dtype) -> np.ndarray:
     """
     if fixed is None:
         return np.empty((0, domain.dim))
-    if isinstance(fixed, str | bool):
+    if isinstance(fixed, bool):
         raise InputTypeError(f"fixed is {fixed!r}, expected positions of generators, an array of shape (k, d)")
+    if isinstance(fixed, str | PathLike | Mapping) or hasattr(fixed, "__geo_interface__"):
+        fixed = list(geometries_of_geojson(fixed))
     if isinstance(next(iter(np.ravel(np.asarray(fixed, object))), None), shapely.Geometry):
         fixed = _coordinates(fixed)
     if not len(domain.check_rows("fixed", fixed)):
@@ -58,7 +62,9 @@ def _coordinates(points: object) -> np.ndarray:
     parts = shapely.get_parts(np.atleast_1d(np.asarray(points, object)))
     other = [part for part in parts if not isinstance(part, shapely.Point) or part.is_empty]
     if other:
-        raise InputTypeError(f"fixed has {other[0]!r:.60}, expected points: an array (k, d), or shapely Points")
+        raise InputTypeError(
+            f"fixed has {other[0]!r:.60}, expected points: an array (k, d), Points of shapely, or GeoJSON"
+        )
     return shapely.get_coordinates(parts, include_z=bool(len(parts) and shapely.has_z(parts).all()))
 
 

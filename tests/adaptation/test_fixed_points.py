@@ -131,7 +131,7 @@ def test_places_behind_a_wall_are_not_taken():
 
 
 def test_what_are_no_positions_is_refused_and_none_are_allowed(adapter):
-    for value in ("wells", [("a", "b")], 3.0):
+    for value in (True, [("a", "b")], 3.0, {"type": "LineString", "coordinates": [(0, 0), (1, 1)]}):
         with pytest.raises(InputTypeError, match="fixed"):
             adapter.run(BOX, 0.1, fixed=value)
     assert adapter.run(BOX, 0.3, fixed=[], effort="fast").settings["fixed"] == 0
@@ -148,7 +148,8 @@ def test_what_are_no_positions_is_refused_and_none_are_allowed(adapter):
 def test_positions_that_are_near_each_other_or_a_wall_give_a_warning(adapter, fixed, text):
     with warnings.catch_warnings(record=True) as seen:
         warnings.simplefilter("always")
-        mesh = adapter.run(BOX, 0.1, fixed=fixed, effort="fast", max_steps=1)
+        given = fixed if text else {"type": "MultiPoint", "coordinates": fixed}
+        mesh = adapter.run(BOX, 0.1, fixed=given, effort="fast", max_steps=1)
     found = [str(w.message) for w in seen if w.category is MismatchWarning]
     assert len(found) == (text is not None)
     assert np.array_equal(mesh.points[: len(fixed)], fixed)
