@@ -8,6 +8,7 @@
 #include "geometry/domain.h"
 #include "opencl/blocks.h"
 #include "opencl/reduce.h"
+#include "opencl/row_entries.h"
 #include "solvers/partial_sums.h"
 #include "solvers/sparse_rows.h"
 
@@ -17,28 +18,6 @@
 #else
 #define SEVERAL false
 #endif
-
-/* The first entry of row j with column i, or -1. `last`: no entry behind it may be read eight at a time. */
-inline int find_entry(int i, int j, int last, global const int *starts, global const int *neighbors)
-{
-    const int end = starts[j + 1];
-    int k = starts[j];
-#if GROUP_SIZE == 1
-    for (; k < end && k <= last; k += 8) {
-        const int8 at = k + (int8)(0, 1, 2, 3, 4, 5, 6, 7), matches = (vload8(0, neighbors + k) == i) & (at < end);
-        const int8 entries = select((int8)(INT_MAX), at, matches);
-        const int4 p4 = min(entries.lo, entries.hi);
-        const int2 p2 = min(p4.lo, p4.hi);
-        const int entry = min(p2.s0, p2.s1);
-        if (entry < end)
-            return entry;
-    }
-#endif
-    for (; k < end; ++k)
-        if (neighbors[k] == i)
-            return k;
-    return -1;
-}
 
 /* Sum of the measures of face k and of the later faces of its row, up to `end`, that lead to the same cell. */
 inline REAL sum_measures(int k, int end, global const int *neighbors, global const FACE *face_measures)

@@ -489,10 +489,13 @@ class Run:
         if not self._options.multilevel:
             warn_of_other_sizes(result)
         if result.converged and self._options.multilevel:
-            mean = float(result.history["mean_error"][-1])
+            mean, last, reason = float(result.history["mean_error"][-1]), result.history[-WINDOW:], ""
             if mean > max(MISSED, self._options.error_target or 0.0):
-                warn_of_errors(result)
                 reason = f"{MISSES}: mean |e| {mean:.2g}"
+            elif len(wild := last["step"][last["residual"] > 1]):
+                reason = f"plan ended, but step {wild[-1]} did not converge: cells are less regular than usual"
+            if reason:
+                warn_of_errors(result)
                 return dataclasses.replace(result, converged=False, stop_reason=reason)
         if result.converged:
             self._note_end_of_trade(result)

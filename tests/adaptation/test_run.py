@@ -1,6 +1,7 @@
 """`Adapter.run` as a user meets it: its promises, its figures on the test field, bad input and nasty size fields."""
 
 import warnings
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ import clvoro
 from clvoro import sizing
 from clvoro.adaptation.diagnostics import MISSED
 from clvoro.errors import ClvoroError, CoarseSizeWarning, InputError, InputTypeError, SizeErrorWarning, SizeFieldError
+from clvoro.solvers.volume_projection import VolumeProjection
 from tests.reference import diagrams as reference
 from tests.reference import diagrams3d as reference3d
 from tests.reference import runs
@@ -627,3 +629,11 @@ def test_a_mesh_that_misses_its_sizes_is_not_completed(ctx):
     assert result.stop_reason.startswith("plan ended, but the sizes are missed: mean |e| ")
     with pytest.warns(CoarseSizeWarning):
         assert not clvoro.Adapter(ctx).run(clvoro.Box((0, 0), (1, 1)), 2.0).converged
+
+
+def test_a_run_whose_last_steps_diverge_says_so(ctx, monkeypatch):
+    solved = VolumeProjection._solution
+    monkeypatch.setattr(VolumeProjection, "_solution", lambda *given: replace(solved(*given), residual=2.0))
+    result = clvoro.Adapter(ctx).run(clvoro.Box((0, 0), (1, 1)), 0.2, "fast")
+    assert not result.converged
+    assert "did not converge" in result.stop_reason

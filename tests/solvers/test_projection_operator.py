@@ -1,14 +1,16 @@
-"""The projection against dense algebra in 2D and 3D, in periodic boxes, on a sphere, and with fixed generators."""
+"""The projection against dense algebra in 2D and 3D, in periodic boxes, a ball, on a sphere, and with fixed ones."""
 
 import numpy as np
 import pytest
 
+from clvoro.geometry.solid.solid import Solid
 from clvoro.geometry.sphere import Sphere
 from clvoro.solvers import volume_projection as projection
 from clvoro.solvers.linear_system import Limits
 from clvoro.solvers.volume_projection import Penalty, Targets, VolumeProjection
 from tests.reference import patch
 
+BALL = Solid.ball((0.5, 0.5, 0.5), 0.5, edge=0.2)
 EPS, QUALITY_SCALE, LOG_RATIO_SCALE = 0.2, 0.3, 0.4
 
 
@@ -60,10 +62,12 @@ class Given:
         ways = patch.ways(host, self.box)
         for k in np.flatnonzero(host.neighbors >= 0):
             i, j, d = host.owners[k], host.neighbors[k], ways[k]
-            w = host.face_measures[k] / np.linalg.norm(d) / host.volumes[i]
-            J[i, j] += w * (d - host.face_centroids[k])
-            J[i, i] += w * host.face_centroids[k]
+            w, m = host.face_measures[k] / np.linalg.norm(d), host.face_centroids[k]
+            J[i, i] += w / host.volumes[i] * m
             worst[i] = min(worst[i], self.quality[j])
+            # In a solid both cells have a face of their own: the mean of the derivatives by both.
+            J[i, j] += w / host.volumes[i] * (d - m) / 2
+            J[j, i] -= w / host.volumes[j] * m / 2
         J[np.arange(self.n), np.arange(self.n)] -= self.box.cell_dim * self.gradient
         if self.box.cell_dim < dim:  # on a sphere generators move in their tangent planes
             normal = host.points
@@ -85,12 +89,13 @@ class Given:
         ("slab", "float64", None),
         ("sphere", "float64", None),
         ("sphere", "float32", 16),
+        ("ball", "float64", None),
     ],
     ids=lambda p: f"{p[0]}, {p[1]}" + (", groups" if p[2] else ""),
 )
 def kind(ctx, request):
     name, real, group_size = request.param
-    box = Sphere(1) if name == "sphere" else patch.BOXES[name]
+    box = {"sphere": Sphere(1), "ball": BALL}.get(name) or patch.BOXES[name]
     return patch.make_engine(ctx, real, box.dim, group_size, box), box
 
 
