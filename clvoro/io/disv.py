@@ -81,6 +81,8 @@ class Disv(Sealed):
         Centers of the cells: the generators.
     boundaries : dict of DisvBoundary
         Faces on each boundary of the domain, by its name. Another name raises InputError.
+    lines : (k, 2) int64
+        The two cells of each face on lines inside the domain, as the package HFB takes them.
     """
 
     vertices: np.ndarray
@@ -88,6 +90,7 @@ class Disv(Sealed):
     cell_vertices: np.ndarray
     centers: np.ndarray
     boundaries: DisvBoundaries
+    lines: np.ndarray
 
     @property
     def gridprops(self) -> dict[str, Any]:
@@ -174,4 +177,12 @@ def make_disv(diagram: Diagram, walls: WallShape) -> Disv:
         rows = rows[np.argsort(mesh.owner[rows], kind="stable")]
         found[name] = DisvBoundary(mesh.owner[rows], mesh.area[rows], mesh.near[rows], mesh.foot[rows])
     starts, corners = take_rows(starts, loops, cells, np.ones(len(cells), bool))
-    return Disv(mesh.points, starts, corners, diagram.points.astype(float), found)
+    inner, faces, rows = _pairs(mesh, np.arange(mesh.n_inner)), diagram.faces, diagram.border_faces
+    n = len(diagram)
+    on_lines = np.isin(inner @ [n, 1], _pairs(faces, rows) @ [n, 1])
+    return Disv(mesh.points, starts, corners, diagram.points.astype(float), found, inner[on_lines])
+
+
+def _pairs(mesh: Faces, rows: np.ndarray) -> np.ndarray:
+    """Return the two cells of faces between cells, the first one first, (k, 2) int64."""
+    return np.sort(np.column_stack([mesh.owner[rows], mesh.neighbor[rows]]), axis=1).astype(np.int64)

@@ -150,6 +150,15 @@ def test_boundaries_have_names_cells_and_lengths(lake):
     assert np.abs(feet[:, 0] * 1 + feet[:, 1] * 0.1).max() < 1e-12  # on the line from (-0.1, 1) to (0, 0)
 
 
+def test_lines_inside_have_cells_that_are_connected():
+    """Four cells meet in points on a line: a pair of them across has a face of the diagram, and none in the grid."""
+    ground = clvoro.Box((0, 0), (1, 1)).with_lines([[(0.1, 0.4), (0.9, 0.6)]])
+    disv = clvoro.adapt(ground, 0.1, "fast").to_disv()
+    connections = modflow_connections(disv)[0]
+    lengths = [connections[i, j][0] for i, j in disv.lines.tolist()]
+    assert sum(lengths) == pytest.approx(math.hypot(0.8, 0.2), rel=0.05)
+
+
 def test_flopy_takes_the_grid(lake, tmp_path):
     flopy = pytest.importorskip("flopy")
     disv = lake.to_disv()
