@@ -151,12 +151,16 @@ def test_boundaries_have_names_cells_and_lengths(lake):
 
 
 def test_lines_inside_have_cells_that_are_connected():
-    """Four cells meet in points on a line: a pair of them across has a face of the diagram, and none in the grid."""
-    ground = clvoro.Box((0, 0), (1, 1)).with_lines([[(0.1, 0.4), (0.9, 0.6)]])
-    disv = clvoro.adapt(ground, 0.1, "fast").to_disv()
+    """Four cells meet in points on a line. Far from the origin some of them have faces as short as round-off."""
+    ground = clvoro.Box((5e6, 5e6), (5e6 + 1000, 5e6 + 1000)).with_lines(
+        [[(5e6 + 100, 5e6 + 400), (5e6 + 900, 5e6 + 600)]]
+    )
+    mesh = clvoro.adapt(ground, 60, "fast")
+    disv = mesh.to_disv()
+    assert len(disv.lines) < len(mesh.diagram.border_faces)
     connections = modflow_connections(disv)[0]
     lengths = [connections[i, j][0] for i, j in disv.lines.tolist()]
-    assert sum(lengths) == pytest.approx(math.hypot(0.8, 0.2), rel=0.05)
+    assert sum(lengths) == pytest.approx(math.hypot(800, 200), rel=0.05)
 
 
 def test_flopy_takes_the_grid(lake, tmp_path):
