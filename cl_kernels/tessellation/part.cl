@@ -129,6 +129,22 @@ kernel void sum_cells(const int size, const int n, const int rows, global const 
         sums[6 * t + k] = all[k];
 }
 
+/* bounds[2 DIM t ...] = the lower and the upper corner of the box around a share of the n points. One work-item per t;
+   `size` is a multiple of GROUP_SIZE. */
+kernel void bound_points(const int size, const int n, global const REAL *points, global REAL *bounds)
+{
+    WORK_ITEM(t);
+    for (int a = 0; a < DIM; ++a) {
+        REAL lower = REAL_MAX, upper = -REAL_MAX;
+        for (LOOP_OF_ITEM(i, n, t / GROUP_SIZE, size / GROUP_SIZE, t % GROUP_SIZE)) {
+            lower = fmin(lower, points[DIM * i + a]);
+            upper = fmax(upper, points[DIM * i + a]);
+        }
+        bounds[2 * DIM * t + a] = lower;
+        bounds[2 * DIM * t + DIM + a] = upper;
+    }
+}
+
 /* values[n + g] = values[rows[g]] for each ghost g. Rows of values have `words` 32-bit words of any type. A ghost
    without owner, rows[g] < 0, keeps its values. One work-item per ghost. */
 kernel void forward_values(const int size, const int n, global const int *rows, const int words, global uint *values)

@@ -20,6 +20,8 @@ SPLIT_COUNT = {2: 10, 3: 18}
 """A bin with more generators is divided by a finer grid. Uniform random sets (Poisson, mean 2) stay on one level."""
 SPACING_COUNT = 8
 """Least number of generators from which the spacing around a leaf is estimated."""
+BOUNDS = 256
+"""Number of shares of the generators of a part whose extents are found."""
 _ZERO = np.zeros(1, np.int32)
 _WORK = ("_keys", "_counts", "_grid_of", "_grid_items", "_starts", "_flags", "_sizes")
 """Buffers that only `build` uses."""
@@ -148,14 +150,16 @@ class Bins:
         """Sort the first `n` of `points` (n, d; normalized coordinates, within `box`) into bins.
 
         In a power diagram rows of `points` end with weights. The host reads two integers per level, at once; uniform
-        sets have one level. On ranks it reads the points of its part as well, for their extent.
+        sets have one level. On ranks it reads the extent of the points of its part as well.
         """
         engine, k, d = self.engine, self._kernels, self.engine.dim
         lower, upper = (corner.astype(np.float64)[:d] for corner in box.device_corners(engine.real))
         if n and engine.peers.count > 1:
             # A part of a domain fills a part of the box.
-            x = np.ascontiguousarray(points[:n].get().T[:d], np.float64)
-            lower, upper = x.min(axis=1), x.max(axis=1)
+            bounds = engine.scratch((BOUNDS, 2, d))
+            engine.run_each(engine.kernels("tessellation/part", shared=True).bound_points, BOUNDS, n, points, bounds)
+            of_shares = bounds.get().astype(np.float64)
+            lower, upper = of_shares[:, 0].min(axis=0), of_shares[:, 1].max(axis=0)
         edge = root_edge(upper - lower, n)
         sides = np.maximum(1, np.ceil((upper - lower) / edge).astype(int))
         root_bins = int(np.prod(sides)) + 1

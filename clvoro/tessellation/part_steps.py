@@ -29,6 +29,7 @@ from ..errors import ClvoroError
 from ..geometry.domain import Domain
 from ..opencl.device_array import buffer_of
 from ..opencl.primitives import NamedArrays
+from .bins import BinnedPoints
 from .clipped.cut import Cut
 from .cut_cells import CutCells
 from .decomposition import hilbert_keys
@@ -470,16 +471,19 @@ class PartSteps(DomainSteps):
             if before.n != part.count:
                 return None
 
+        @cache
+        def binned() -> BinnedPoints:
+            return stages.bins.build(self.box, part.points, part.count)
+
         def clip(cells: Polyhedra, cut: CutCells, report: cla.Array, _: int) -> None:
-            binned = stages.bins.build(self.box, part.points, part.count)
-            cells.clip_rest(cut, report, part, binned, before)
+            cells.clip_rest(cut, report, part, binned(), before)
 
         t = stages.update.update(stages.cells, self.box, part.points, before, clip=clip)
         if t is not None:
             part.order_rows(stages.engine, t, stages.cells.defines)
         else:
-            binned = stages.bins.build(self.box, part.points, part.count)
-            t = stages.cells.tessellate(part, binned, exact=False, rows=part.count if self._reads_rows else n)
+            rows = part.count if self._reads_rows else n
+            t = stages.cells.tessellate(part, binned(), exact=False, rows=rows)
         made = self._finished(part, t)
         if made is not None:
             follow(made, None)
