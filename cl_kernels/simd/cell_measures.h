@@ -40,13 +40,14 @@ inline void measure_plane_outlines(const measures_t *to, eight_rows_t *all, cons
     const int most = all->most, first = all->first;
     FACE8 lengths[ROW_CAPACITY];
     FACE16 middles[ROW_CAPACITY];
-    double8 area = 0, cx = 0, cy = 0, xx = 0, xy = 0, yy = 0;
+    double8 area = 0, cx = 0, cy = 0, xx = 0, xy = 0, yy = 0, far2 = 0;
     const long8 ends = vload8(0, all->counts), last = max(ends - 1, (long8)(0));
     double8 vx = pick(corners->x, last), vy = pick(corners->y, last);
     for (int k = 0; k < most; ++k) {
         const long8 here = k < ends;
         const double8 wx = here ? corners->x[k] : 0, wy = here ? corners->y[k] : 0;
         const double8 ex = wx - vx, ey = wy - vy, sx = vx + wx, sy = vy + wy;
+        far2 = fmax(far2, wx * wx + wy * wy);
         lengths[k] = CONVERT_FACE8(sqrt(ex * ex + ey * ey));
         middles[k].even = CONVERT_FACE8(sx / 2);
         middles[k].odd = CONVERT_FACE8(sy / 2);
@@ -64,13 +65,14 @@ inline void measure_plane_outlines(const measures_t *to, eight_rows_t *all, cons
     /* As in `write_moments`. */
     const long8 full = area > 0;
     const double8 mx = full ? cx / (3 * area) : cx, my = full ? cy / (3 * area) : cy;
-    double results[6 * LANES];
+    double results[7 * LANES];
     vstore8(area / 2, 0, results);
     vstore8(mx, 1, results);
     vstore8(my, 2, results);
     vstore8(full ? xx / (12 * area) - mx * mx : xx, 3, results);
     vstore8(full ? xy / (12 * area) - mx * my : xy, 4, results);
     vstore8(full ? yy / (12 * area) - my * my : yy, 5, results);
+    vstore8(far2, 6, results);
     for (int lane = 0; lane < LANES && first + lane < all->size; ++lane) {
         const int i = first + lane, start = to->starts[i];
         if (!all->inside[lane]) {
@@ -88,11 +90,13 @@ inline void measure_plane_outlines(const measures_t *to, eight_rows_t *all, cons
             to->offsets[2 * i + a] = LANE(results, 1 + a, lane);
         for (int a = 0; a < 3; ++a)
             to->covariances[3 * i + a] = LANE(results, 3 + a, lane);
+        write_reach(to, i, LANE(results, 6, lane));
     }
 }
 #endif
 
-/* Measure the cells of LANES generators from number `first` on. */
+/* Measure the cells of LANES generators from number `first` on. Without `places` their rows lie in the graph already.
+ */
 inline void measure_eight(const measures_t *to, int first, int size, const face_rows_t *rows, global const uint *keep,
                           global const double *points, const double *lower, const double *upper)
 {
@@ -100,7 +104,7 @@ inline void measure_eight(const measures_t *to, int first, int size, const face_
     eight_rows_t all;
     int most = 0;
     for (int lane = 0; lane < LANES; ++lane) {
-        const int i = min(first + lane, size - 1), place = rows->places[i];
+        const int i = min(first + lane, size - 1), place = place_of_row(rows, i);
         int n;
         face_row(rows, i, &n);
         /* `measure_cell` also handles rows with dropped faces. */
@@ -119,7 +123,7 @@ inline void measure_eight(const measures_t *to, int first, int size, const face_
             const int face = n > 0 ? row[k < n ? k : 0] : -1;
             least = min(least, face);
             put_behind(behind, k, lane, max(face, 0), points);
-            if (start + k < end)
+            if (rows->places && start + k < end)
                 to->neighbors[start + k] = face;
         }
         all.inside[lane] = least >= 0;

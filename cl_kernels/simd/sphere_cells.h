@@ -25,7 +25,7 @@ inline void measure_sphere_outlines(const measures_t *to, eight_rows_t *all, con
     FACE16 middles[ROW_CAPACITY];
     double8 e[3], f[3], d[3];
     find_tangents(sites, e, f);
-    double8 area = 0, flat = 0, radial = 0, tx = 0, ty = 0, cx = 0, cy = 0, xx = 0, xy = 0, yy = 0;
+    double8 far2 = 0, area = 0, flat = 0, radial = 0, tx = 0, ty = 0, cx = 0, cy = 0, xx = 0, xy = 0, yy = 0;
     const long8 ends = vload8(0, all->counts), last = max(ends - 1, (long8)(0));
     long8 large = 0;
     double8 vx = pick(corners->x, last), vy = pick(corners->y, last);
@@ -34,6 +34,7 @@ inline void measure_sphere_outlines(const measures_t *to, eight_rows_t *all, con
         const long8 here = k < ends;
         const double8 wx = here ? corners->x[k] : 0, wy = here ? corners->y[k] : 0;
         const double8 q2 = wx * wx + wy * wy, sink = SINK_SERIES(double8, q2);
+        far2 = fmax(far2, q2);
         large |= !(q2 <= SHORT_REACH2);
         /* As in `measure_short_arc`. */
         const double8 cross = here ? cross_in_plane(vx, wy, vy, wx) : 0;
@@ -68,7 +69,7 @@ inline void measure_sphere_outlines(const measures_t *to, eight_rows_t *all, con
         vy = wy;
         from_sink = sink;
     }
-    double results[7 * LANES];
+    double results[8 * LANES];
     long wide[LANES];
     vstore8(large | !(radial > 0) | !(flat > 0), 0, wide);
     vstore8(area, 0, results);
@@ -80,6 +81,7 @@ inline void measure_sphere_outlines(const measures_t *to, eight_rows_t *all, con
     vstore8(xx * scale - mx * mx, 4, results);
     vstore8(xy * scale - mx * my, 5, results);
     vstore8(yy * scale - my * my, 6, results);
+    vstore8(far2, 7, results);
     for (int lane = 0; lane < LANES && first + lane < all->size; ++lane) {
         const int i = first + lane, start = to->starts[i];
         if (!all->inside[lane] || wide[lane]) {
@@ -94,6 +96,7 @@ inline void measure_sphere_outlines(const measures_t *to, eight_rows_t *all, con
             to->face_centroids[3 * (start + k) + 2] = LANE((const FACE *)heights, k, lane);
         }
         to->volumes[i] = LANE(results, 0, lane);
+        write_reach(to, i, LANE(results, 7, lane));
         EACH_AXIS (a) {
             to->offsets[3 * i + a] = LANE(results, 1 + a, lane);
             to->covariances[3 * i + a] = LANE(results, 4 + a, lane);

@@ -19,7 +19,7 @@ inline bool are_right(global const int *report, int room)
 
 #define ELSEWHERE INT_MAX
 
-/* places[i]  first slot of row i, or -1 if it lies in the previous graph
+/* places[i]  first slot of row i, or -1 if it lies in the previous graph; places may be 0 if all lie there
    counts[s]  faces from slot s on, negative if round-off leaves a doubt; ELSEWHERE: the row begins in the slot given
               there */
 typedef struct {
@@ -33,10 +33,15 @@ inline face_rows_t face_rows(global const int *places, global const int *slots, 
     return rows;
 }
 
+inline int place_of_row(const face_rows_t *rows, int i)
+{
+    return rows->places ? rows->places[i] : -1;
+}
+
 /* Row i and the number of its faces. */
 inline global const int *face_row(const face_rows_t *rows, int i, int *n)
 {
-    const int place = rows->places[i];
+    const int place = place_of_row(rows, i);
     if (place < 0) {
         const int start = rows->old_starts[i];
         *n = rows->old_starts[i + 1] - start;

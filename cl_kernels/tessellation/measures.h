@@ -7,13 +7,20 @@ typedef struct {
     global int *neighbors;
     global FACE *face_measures, *face_centroids;
     global REAL *volumes, *offsets, *covariances;
+    global float *reach; /* distances of the farthest corners; may be 0 */
 } measures_t;
+
+inline void write_reach(const measures_t *to, int i, REAL far2)
+{
+    if (to->reach)
+        to->reach[i] = (float)sqrt(far2);
+}
 
 /* The faces of generator i that are kept. Returns their number. */
 inline int kept_faces(int *faces, const face_rows_t *rows, global const uint *keep, int i)
 {
     int n = 0, listed;
-    const int place = rows->places[i];
+    const int place = place_of_row(rows, i);
     global const int *row = face_row(rows, i, &listed);
     for (int k = 0; k < listed; ++k)
         if (place < 0 || ((keep[place + k / 32] >> (k % 32)) & 1u))
@@ -44,6 +51,7 @@ inline void measure_plane_cell(const measures_t *to, int i, const int *faces, in
     SITE(x, i, points);
     const int start = to->starts[i];
     moments_t moments = {0, 0, 0, 0, 0, 0};
+    REAL far2 = 0;
     if (n >= 3) {
         const REAL2 origin = corner(i, x, faces[n - 1], faces[0], points, lower, upper);
         REAL2 v = origin;
@@ -51,6 +59,7 @@ inline void measure_plane_cell(const measures_t *to, int i, const int *faces, in
             const REAL2 w = k == n - 1 ? origin : corner(i, x, faces[k], faces[k + 1], points, lower, upper);
             REAL middle[2];
             add_triangle(&moments, v, w);
+            far2 = fmax(far2, dot(w, w));
             to->neighbors[start + k] = faces[k];
             to->face_measures[start + k] = measure_face(x, v, w, middle);
             to->face_centroids[2 * (start + k)] = middle[0];
@@ -59,5 +68,6 @@ inline void measure_plane_cell(const measures_t *to, int i, const int *faces, in
         }
     }
     write_moments(&moments, i, to->volumes, to->offsets, to->covariances);
+    write_reach(to, i, far2);
 }
 #endif

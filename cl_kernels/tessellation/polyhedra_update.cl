@@ -218,12 +218,14 @@ kernel void begin_cell_updates(const int size, const int used, const int report_
 
    `old_corners` and `old_keys`: the triples, from 2 old_starts[i] on, and keys of the previous cells; none if not
    `known`. Cells are written to their previous places, and those with more faces behind all these, from report[1] on.
-   changed[i]: the set of its faces that neighbors must be compared with. */
+   changed[i]: the set of its faces that neighbors must be compared with. reach[i], if `with_reach`: the distance of its
+   farthest corner. */
 kernel void update_cells(const int size, const int which, const int n, global const int *listed,
                          global const int *further, global const int *old_starts, global const int *old_neighbors,
                          const int known, global const uchar4 *old_corners, global const uint *old_keys,
                          global const REAL *points, CLIP_BOX_ARGS, const int room, CELL_OUTPUT_ARGS, global uint *keys,
-                         global int *changed, global int *more, global int *marks PERIOD_ARGS)
+                         global int *changed, const int with_reach, global float *reach, global int *more,
+                         global int *marks PERIOD_ARGS)
 {
     LONG_ITEM(item);
     if (which == MARKED_CELLS && item >= report[REPORT_PLACED])
@@ -279,6 +281,8 @@ kernel void update_cells(const int size, const int which, const int n, global co
             row_places[i] = place;
             row_counts[i] = cell.faces | CERTAIN;
             write_triples(&cell, corners + 2 * place, KNOWN_CORNERS);
+            if (with_reach)
+                reach[i] = (float)sqrt(cell.reach2);
             for (int f = 0; kept && f < cell.faces; ++f)
                 keys[place + f] = old_keys[start + f];
             if (!kept) {

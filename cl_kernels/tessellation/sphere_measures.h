@@ -102,7 +102,7 @@ inline void measure_sphere_cell(const measures_t *to, int i, const int *faces, i
     SITE(x, i, points);
     const int start = to->starts[i];
     moments_t moments = {0, 0, 0, 0, 0, 0};
-    REAL area = 0, radial = 0, d[3];
+    REAL area = 0, radial = 0, far2 = 0, d[3];
     REAL2 tangential = 0;
     if (n >= 3) {
         const REAL2 origin = corner(i, x, faces[n - 1], faces[0], points, lower, upper);
@@ -115,6 +115,7 @@ inline void measure_sphere_cell(const measures_t *to, int i, const int *faces, i
             const arc_t edge = measure_arc(from, next);
             add_triangle(&moments, p, q);
             area += edge.excess;
+            far2 = fmax(far2, next.p2);
             tangential += edge.weight * (REAL2)(p.s1 - q.s1, q.s0 - p.s0);
             radial += (1 + edge.weight) * edge.cross;
             middle_of_arc(x, &edge, d);
@@ -127,6 +128,7 @@ inline void measure_sphere_cell(const measures_t *to, int i, const int *faces, i
     }
     on_sphere(x, radial > 0 ? tangential / radial : (REAL2)(0), d);
     to->volumes[i] = area;
+    write_reach(to, i, far2);
     EACH_AXIS (a)
         to->offsets[3 * i + a] = d[a];
     const REAL3 m = second_moments(&moments);

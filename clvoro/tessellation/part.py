@@ -25,6 +25,7 @@ from ..geometry.domain import ClipBox
 from ..opencl.device_array import buffer_of
 from ..opencl.engine import Engine, PartialSums
 from ..opencl.peers import Peers, Swap
+from .back_ends import LANES, has_lanes
 from .device_diagram import Tessellation
 
 SUMS = 256
@@ -161,12 +162,17 @@ class Part:
 
         `defines` are those of the builder of its cells. `enqueue` stands for `Engine.run_each`.
         """
-        given = (*t.graph, self.labels, t.sites, *self.box.clip_args(engine), *t.vertices[:1])
+        given = (*t.graph, self.labels, t.sites, *self.box.clip_args(engine), *t.vertices)
         reach = engine.scratch(t.n, np.float32) if t.reach is None else t.reach
         measures = t.face_measures, t.face_centroids, t.volumes, t.offsets, t.covariances, reach
-        order = engine.kernels("tessellation/row_order", {**defines, "BY_PLACE": 1}, shared=True).order_rows
-        enqueue = engine.run_each if enqueue is None else enqueue
-        enqueue(order, t.n, *given, *measures, *(engine.period_args if t.vertices else ()))
+        lanes = LANES if engine.cell_dim == 2 and has_lanes(engine) else 1
+        defines = {**defines, "BY_PLACE": 1, "IN_LANES": int(lanes > 1)}
+        order = engine.kernels("tessellation/row_order", defines, shared=True).order_rows
+        args = *given, *measures, *(engine.period_args if t.vertices else ())
+        if enqueue is None:
+            engine.run(order, -(-t.n // lanes), np.int32(t.n), *args)
+        else:
+            enqueue(order, t.n, *args)
 
     def measure_faces(self, engine: Engine, t: Tessellation, defines: dict[str, object]) -> Tessellation:
         """Return `t`, a diagram of this part, with face measures and centroids in full precision, in new arrays."""

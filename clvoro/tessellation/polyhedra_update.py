@@ -145,7 +145,9 @@ class _Rounds:
         old = previous.vertices or (self._listed, self._listed)
         self._box = box
         self._before = (*previous.graph, np.int32(bool(previous.vertices)), *old, points)
-        self._output = (np.int32(self.room), *self.cut.output(report), self.cut.keys, self._changed)
+        reach = self.cut.cells.get("reach", self.cut.cells["volumes"])
+        with_reach = np.int32("reach" in self.cut.cells)
+        self._output = (np.int32(self.room), *self.cut.output(report), self.cut.keys, self._changed, with_reach, reach)
         engine.run_each(
             kernels.begin_cell_updates, n, np.int32(before), np.int32(SIZE), report, self._marks, self._more
         )
