@@ -153,8 +153,8 @@ BOOLEAN_COLUMNS = {
     "what and where": lambda r: r["complaints"],
 }
 KINDS = tuple(f".{kind}" for kind in SOLIDS)
-_WRAPS = 40
-"""Extent of a file's surface over its wrap."""
+_WRAPS = 20
+"""Extent of a file's surface over its wrap; cells there are half as large again."""
 _OFF = 0.1
 """Largest mean distance of the walls from the surface, over h; a chord of a curved wall is nearer."""
 
@@ -173,7 +173,7 @@ def part_of(job: int | tuple[Path, bool], cells: int) -> tuple[clvoro.Solid, flo
     lower, upper = np.array(solid.lower), np.array(solid.upper)
     room = 0.6 * (upper - lower).max()
     air = clvoro.Solid.outside(solid, (lower - room, upper + room))
-    h = (air.measure / cells) ** (1 / 3)
+    h = 3 * (upper - lower).max() / _WRAPS if "wrap" in told else (air.measure / cells) ** (1 / 3)
     return air, h, growing(air, set(air.boundary_names) & set(solid.boundary_names), h), told
 
 

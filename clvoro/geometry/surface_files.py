@@ -159,7 +159,7 @@ def word(name: str, number: int) -> str:
 
 
 def _read_step(path: Path) -> list[FilePart]:
-    """Return the surface of the solids in a STEP file, in meters; faces of one name are a part."""
+    """Return the surface of the solids in a STEP file, united, in meters; faces of one name are a part."""
     try:
         import gmsh
     except (ImportError, OSError) as error:
@@ -176,16 +176,19 @@ def _read_step(path: Path) -> list[FilePart]:
         gmsh.option.setNumber("Mesh.MeshSizeFromCurvature", _TURNS)
         gmsh.model.add("part")
         gmsh.model.occ.importShapes(os.fspath(path))
+        first, *others = gmsh.model.occ.getEntities(3) or [None]
+        if others:  # parts that touch or overlap get common faces
+            gmsh.model.occ.fragment([first], others)
         gmsh.model.occ.synchronize()
         gmsh.model.mesh.generate(2)
         tags, points = (np.asarray(part) for part in gmsh.model.mesh.getNodes()[:2])
         place = np.zeros(int(tags.max()) + 1 if len(tags) else 1, np.int64)
         place[tags] = np.arange(len(tags))
         found: dict[str, list[np.ndarray]] = {}
-        for _, volume in gmsh.model.getEntities(3):
-            for _, face in gmsh.model.getBoundary([(3, volume)], oriented=False):
-                name = gmsh.model.getEntityName(2, abs(face)).rpartition("/")[2]
-                nodes = np.asarray(gmsh.model.mesh.getElementsByType(2, abs(face))[1])
+        for _, face in gmsh.model.getEntities(2):
+            if len(gmsh.model.getAdjacencies(2, face)[0]) == 1:
+                name = gmsh.model.getEntityName(2, face).rpartition("/")[2]
+                nodes = np.asarray(gmsh.model.mesh.getElementsByType(2, face)[1])
                 triangles = place[nodes.astype(np.int64)].reshape(-1, 3)
                 found.setdefault("" if name.startswith(_UNNAMED) else name, []).append(triangles)
     except Exception as error:  # Gmsh raises plain exceptions

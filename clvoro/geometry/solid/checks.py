@@ -93,23 +93,24 @@ def _gaps(surface: Surface, parts: Sequence[str]) -> str:
 
 
 def require_bounding(
-    surface: Surface, vertices: np.ndarray, triangles: np.ndarray, parts: Sequence[str] = ()
+    surface: Surface, vertices: np.ndarray, triangles: np.ndarray, parts: Sequence[str] = (), repair: bool = False
 ) -> np.ndarray:
     """Raise unless the triangles (t, 3) bound a region with normals outwards; return the partners of their sides.
 
     - `surface`: as given, for messages.
     - `vertices`, `triangles`: the welded surface.
     - `parts` (t,) str: the name of the part that each triangle of `surface` belongs to, for messages.
+    - `repair`: whether the surface is repaired already, which is no remedy then.
 
     Raises `InputError` if the surface is open, has duplicate or flipped triangles, is inside out, or intersects itself.
     """
-    name = surface.name
+    name, mend = surface.name, _OR_WRAP if repair else "Or pass repair=True"
     repeated = repeated_triangles(triangles)
     if repeated.size:
         where = format_point(vertices[triangles[repeated[0]]].mean(axis=0))
         raise InputError(
-            f"{name} has {len(repeated)} duplicate triangles, the first at {where}, expected each once; remove them, "
-            "or pass repair=True"
+            f"{name} has {len(repeated)} duplicate triangles, the first at {where}, expected each once; remove "
+            f"them. {mend}"
         )
     surface.require_closed("" if surface.closed else f".{_gaps(surface, parts)} {_closed_by(surface, parts)}")
     twin, bad = pair_sides(vertices, triangles)
@@ -118,13 +119,13 @@ def require_bounding(
         raise InputError(
             f"{name} has {len(bad)} sides of triangles whose neighbors are oriented differently, the first at "
             f"{format_point(vertices[triangles[k, s]])}; expected all triangles counter-clockwise seen from outside; "
-            "flip the others, or pass repair=True"
+            f"flip the others. {mend}"
         )
     try:
         Surface(vertices, triangles, name).check()
     except InputError as error:
-        united = "Parts that cross or touch each other are united by repair=True"
-        raise InputError(f"{error}. {united}. {_OR_WRAP}") from None
+        united = "" if repair else "Parts that cross or touch each other are united by repair=True. "
+        raise InputError(f"{error}. {united}{_OR_WRAP}") from None
     inner, outer = _sides_wound(vertices, triangles, twin)
     wrong = np.flatnonzero((inner != 1) | (outer != 0))
     if not wrong.size:

@@ -173,7 +173,8 @@ class Solid(Domain):
         whole = (merged != np.roll(merged, -1, axis=1)).all(axis=1)
         self._group, merged = group[whole], merged[whole]
         self.surface = Surface(places, merged, name)
-        self.twin = require_bounding(given, places, merged, [self._group_names[g] for g in group.tolist()])
+        parts = [self._group_names[g] for g in group.tolist()]
+        self.twin = require_bounding(given, places, merged, parts, repair or bottom is not None)
         angle = 30 if angle is None else angle
         if not (isinstance(angle, Real) and 0 < angle < 180):
             raise InputError(f"{name} angle is {angle!r}, expected degrees between 0 and 180")
@@ -232,7 +233,8 @@ class Solid(Domain):
         """Read a solid from STL, OBJ, PLY, OFF or 3MF files with trimesh, or from a STEP file with Gmsh.
 
         Solids of an STL file, groups of an OBJ file, objects of a 3MF file and named faces of a STEP file give
-        boundaries their names. Several files are parts of one surface, which have the names of their files.
+        boundaries their names. Parts of a STEP file that touch or overlap are united. Several files are parts of one
+        surface, which have the names of their files.
 
         Parameters
         ----------

@@ -43,19 +43,21 @@ def test_every_format_brings_the_same_solid(tmp_path, kind):
     assert Solid.from_trimesh(mesh).measure == pytest.approx(ball.measure)
 
 
-def test_a_step_file_is_read_in_meters(tmp_path):
+def test_a_step_file_is_read_in_meters_and_its_parts_are_united(tmp_path):
     gmsh = pytest.importorskip("gmsh")
     gmsh.initialize(interruptible=False)
     try:
         gmsh.option.setNumber("General.Terminal", 0)
         gmsh.model.occ.addCylinder(0, 0, 0, 0, 0, 20, 5)
+        gmsh.model.occ.addBox(-2, -2, 15, 4, 4, 10)  # overlaps
+        gmsh.model.occ.addBox(-2, -2, 25, 4, 4, 5)  # touches
         gmsh.model.occ.synchronize()
         gmsh.write(str(tmp_path / "part.step"))
     finally:
         gmsh.finalize()
     solid = Solid.read(tmp_path / "part.step")
-    assert solid.measure == pytest.approx(np.pi * 0.005**2 * 0.02, rel=0.02)
-    assert solid.n_patches == 3
+    assert solid.measure == pytest.approx(np.pi * 0.005**2 * 0.02 + 0.004**2 * 0.01, rel=0.02)
+    assert (solid.n_patches, solid.n_pieces) == (3 + 5, 1)
 
 
 def test_the_outside_of_a_body_has_the_names_of_both():
