@@ -31,8 +31,10 @@ def test_creases_are_shapes_and_wrong_numbers_are_refused():
     cube = Solid.box((0, 0, 0), (1, 1, 1))
     size = sizing.Distance(cube.crease_edges(), h_min=0.1, slope=1)
     assert size(np.array([(0.5, 0.5, 0.5), (0.5, 0, 0)])) == pytest.approx([0.1 + 0.5**0.5, 0.1])
-    with pytest.raises(InputError, match="no concave creases"):
-        cube.crease_edges(concave=True)
+    low = sizing.Distance(cube.crease_edges("zMin"), h_min=0.1, slope=1)
+    assert low(np.array([(0.5, 0, 0), (0.5, 0, 0.4), (0.5, 0, 1)])) == pytest.approx([0.1, 0.5, 1.1])
+    with pytest.raises(InputError, match="no concave creases at 'zMin'"):
+        cube.crease_edges("zMin", concave=True)
     for field in (sizing.curvature_size, sizing.gap_size):
         with pytest.raises(InputTypeError, match=r"got a Box, expected a clvoro\.Solid"):
             field(Box((0, 0, 0), (1, 1, 1)), h_min=0.1, h_max=1)

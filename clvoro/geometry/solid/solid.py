@@ -572,17 +572,27 @@ class Solid(Domain):
         along = np.abs(np.einsum("tkd,tkd->tk", turn, sides))
         return np.divide(along, length2, out=np.zeros_like(along), where=length2 > 0).max(axis=1)
 
-    def crease_edges(self, concave: bool | None = None) -> Edges:
-        """Return creases as a shape for `clvoro.sizing.Distance`: all, or only those that are concave, or convex.
+    def crease_edges(self, walls: Walls | None = None, *, concave: bool | None = None) -> Edges:
+        """Return creases as a shape for `clvoro.sizing.Distance`.
+
+        Parameters
+        ----------
+        walls : int, str, or a sequence of them, optional
+            Numbers or names of patches, such as those of a body in a flow: only creases of these; by default all.
+        concave : bool, optional
+            Whether only creases that are concave, or convex.
 
         Raises
         ------
         InputError
             If there are none.
         """
-        chosen = np.ones(len(self.creases), bool) if concave is None else self.creases.concave == concave
+        chosen = np.isin(self.creases.patches, self.boundaries.select("walls", walls)).any(axis=1)
+        if concave is not None:
+            chosen &= self.creases.concave == concave
         if not chosen.any():
-            raise InputError(f"{self} has no {'' if concave is None else 'concave ' if concave else 'convex '}creases")
+            kind = "" if concave is None else "concave " if concave else "convex "
+            raise InputError(f"{self} has no {kind}creases{'' if walls is None else f' at {walls!r:.60}'}")
         ends = self.surface.vertices[self.creases.edges[chosen]]
         return Edges(ends[:, 0], ends[:, 1])
 
