@@ -28,7 +28,7 @@ DIALECT = re.compile(
 )
 WORDS_OF_OTHERS = {
     "optimisation": ("bench/cylinder.py",),
-    "neighbour": ("/io/", "foam"),  # OpenFOAM's file
+    "neighbour": ("/io/", "foam", "guide/files.md"),  # OpenFOAM's file, and entry of its dictionaries
     "centre": ("/io/", "tests/cli/test_cases.py"),  # a file format's, and a mistake in a case
 }
 """British words, and parts of paths where others have chosen them."""
