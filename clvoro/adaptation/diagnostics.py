@@ -116,7 +116,8 @@ def warn_of_errors(result: Result) -> None:
         return  # `CoarseSizeWarning` says it before the run
     place = diagram.domain.place_name(result.points[worst])
     near = [worst, *_ring(diagram, worst)]
-    steep = any(abs(math.log(sizes[j] / sizes[i])) > math.log(STEEP) for i in near for j in _ring(diagram, i))
+    pairs = ((i, j) for i in near for j in _ring(diagram, i) if amounts[i] and amounts[j])  # not of sizes of their own
+    steep = any(abs(math.log(sizes[j] / sizes[i])) > math.log(STEEP) for i, j in pairs)
     if diagram.layer.any():
         why = (
             "cells beside layers of prisms make room for them, and are too large where these are thinner than given: "

@@ -4,6 +4,7 @@ import json
 import math
 import re
 import warnings
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ import shapely
 
 import clvoro
 from clvoro import sizing
-from clvoro.adaptation.diagnostics import warn_of_narrow_parts
+from clvoro.adaptation.diagnostics import warn_of_errors, warn_of_narrow_parts
 from clvoro.cli import command as cli
 from clvoro.errors import CoarseSizeWarning, MismatchWarning, SizeErrorWarning
 from clvoro.geometry.boundary_layers import LayerRows
@@ -286,6 +287,21 @@ def test_warnings_of_coarse_sizes(ctx, size, n_cells, category, advice):
         assert advice in str(w.message)
         assert "Graded" not in str(w.message)
         assert w.filename == __file__
+
+
+@pytest.mark.parametrize(("error", "advice"), [(0.0, "do not fill evenly"), (0.1, "sizing.Graded")])
+def test_sizes_of_their_own_are_not_steep(error, advice):
+    """Cells at creases have sizes of their own, and no error."""
+    diagram = clvoro.voronoi(clvoro.Box((0, 0), (1, 1)), np.random.default_rng(4).random((30, 2)))
+    sizes, errors = np.full(30, 0.2), np.full(30, 0.01)
+    worst = 3
+    errors[worst] = 9.0
+    row = diagram.neighbors[diagram.neighbor_starts[worst] : diagram.neighbor_starts[worst + 1]]
+    beside = int(row.max())
+    sizes[beside], errors[beside] = 0.05, error
+    result = SimpleNamespace(diagram=diagram, target_size=sizes, size_error=errors, points=diagram.points, settings={})
+    with pytest.warns(SizeErrorWarning, match=advice):
+        warn_of_errors(result)
 
 
 def test_size_errors_in_polygons_have_a_remedy():
