@@ -7,6 +7,7 @@ import math
 import os
 import time
 from collections.abc import Callable, Mapping, Sequence
+from itertools import zip_longest
 from typing import Any, NamedTuple, TypeVar, cast
 
 import numpy as np
@@ -135,6 +136,8 @@ class Peers:
             for name in {**found[0], **other}:
                 if (expected := found[0].get(name)) == (value := other.get(name)):
                     continue
+                lines = zip_longest(str(value).splitlines(), str(expected).splitlines())
+                value, expected = next((pair for pair in lines if pair[0] != pair[1]), (value, expected))
                 where = f"rank {number} of {self.count} has {name} = {value!s:.200}, expected {expected!s:.200},"
                 if self.number:
                     raise RankError(f"{where} as rank 0 has")

@@ -22,7 +22,7 @@ import pyopencl as cl
 from pyopencl.characterize import has_src_build_cache
 
 from ..errors import BuildError
-from .runtimes import remove_dead_locks
+from .runtimes import full_cache_remedy, remove_dead_locks
 
 _INCLUDE = re.compile(r'^\s*#include\s+"([^"]+)"\s*$')
 _lock = threading.Lock()
@@ -83,7 +83,7 @@ def build_program(ctx: cl.Context, name: str, defines: Mapping[str, object], pre
     try:
         return _build_once(ctx, *program_text(name, defines, prelude))
     except cl.Error as error:
-        raise BuildError(f"cl_kernels/{name} does not compile: {error}") from error
+        raise BuildError(f"cl_kernels/{name} does not compile: {full_cache_remedy()}{error}") from error
 
 
 def _build_once(ctx: cl.Context, text: str, options: tuple[str, ...]) -> cl.Program:

@@ -96,6 +96,14 @@ def cache_remedy() -> str:
     )
 
 
+def full_cache_remedy() -> str:
+    """Return advice if nothing can be written to the user's cache folder, else nothing."""
+    with contextlib.suppress(RuntimeError):  # the user has no home
+        if not _has_room(cache_home()):
+            return f"nothing can be written to {cache_home()}. {cache_remedy()}. "
+    return ""
+
+
 def remove_dead_locks() -> None:
     """Remove the lock of PyOpenCL's cache that a process has left which was killed while it read or wrote the cache.
 

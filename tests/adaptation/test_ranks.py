@@ -11,6 +11,7 @@ import sys
 import threading
 import types
 from contextlib import nullcontext
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -475,14 +476,21 @@ def test_what_ranks_cannot_share_is_refused(ctx, domain, change):
 
 
 @pytest.mark.parametrize(
-    ("name", "shown"), [("seed", "seed = 1, expected 0"), ("points", "points = "), ("size", "cells")]
+    ("name", "shown"),
+    [
+        ("seed", "seed = 1, expected 0"),
+        ("points", "points = "),
+        ("size", "cells"),
+        ("case", "case = 1, expected 0, as"),
+    ],
 )
 def test_parts_with_other_input_are_refused(ctx, name, shown):
     def work(peers):
         adapter, errors = clvoro.Adapter(ctx, comm=peers), InputError if peers.number == 0 else RankError
         changed = {"seed": peers.number, "points": [(0.5, 0.2 + 0.1 * peers.number)], "size": 0.2 - 0.1 * peers.number}
         with pytest.raises(errors, match=f"rank 1 of 2 has {shown}"):
-            adapter.run(clvoro.Box((0, 0), (1, 1)), **{"size": 0.2, name: changed[name]})
+            peers.agree(lambda: None, lambda _: {"case": f"[run]\n{peers.number}"} if name == "case" else {})
+            adapter.run(clvoro.Box((0, 0), (1, 1)), **{"size": 0.2, name: changed.get(name)})
 
     Team(2).run(work)
 

@@ -401,6 +401,8 @@ def test_caches_go_where_there_is_room(tmp_path, monkeypatch):
     assert _runtimes.provide_cache() is None
     with room(_runtimes._ROOM - 1):  # nowhere
         assert _runtimes.provide_cache() is None
+        assert _runtimes.full_cache_remedy().startswith(f"nothing can be written to {tmp_path}. If")
+    assert _runtimes.full_cache_remedy() == ""
     assert os.environ["XDG_CACHE_HOME"] == str(tmp_path)
     full = {tmp_path}
     plain = _runtimes._has_room
