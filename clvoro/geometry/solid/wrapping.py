@@ -23,6 +23,7 @@ from ...errors import InputError
 from ..nearest_triangles import NearestTriangles
 from ..surface import Surface
 from ..triangles import areas_of, packed_weights
+from .checks import repeated_triangles
 from .combining import boolean, library
 from .creases import connect, pair_sides
 
@@ -33,8 +34,8 @@ _STEP, _EDGE = 3, 1.5
 _SHEAR = np.array([(1, 0, 0), (0.17, 1, 0), (0.11, 0, 1)])
 _UNSHEARED = np.linalg.inv(_SHEAR)
 """The library sees positions times this matrix: its level sets crash, at times, at large planes x = constant."""
-_SIMPLER = 0.1
-"""How far triangles may move to be fewer, in steps of the grid."""
+_SIMPLER = (0.1, 0.05, 0)
+"""How far triangles may move to be fewer, in steps of the grid: the first one whose surface does not cross itself."""
 _SPACING, _APART = 1.0, 0.25
 """Distances are those to the triangle of the nearest sample. Longest edge of the parts of triangles that have a sample,
 and edge of the cubes that keep one of their samples, in steps of the grid."""
@@ -96,13 +97,17 @@ def wrapped(
     away = grid.distance(samples, 2 * reach)
     space = grid.space(away, reach, inside, middle, near)
     sign = -1 if inside is None else 1
-    first = grid.level(name, sign * np.where(space, away - reach, -np.abs(away - reach)), _SIMPLER)
+    first = grid.level(name, sign * np.where(space, away - reach, -np.abs(away - reach)), _SIMPLER[0])
     depth = np.where(space, 0, grid.distance(_Samples(first, step), 1.5 * reach, ~space))
     place = np.zeros(len(names), np.int64)
     place[[names.index(k) for k in kept]] = 1 + np.arange(len(kept))
     made, group = _with_groups(grid.level(name, sign * ((1 - _OFF) * reach - depth)), near, place[groups], reach)
     names = ("rest" if rest in kept else rest, *kept)
-    result = boolean("+", (made.vertices, made.triangles, group, list(names)), simpler=_SIMPLER * step)
+    for share in _SIMPLER:
+        result = boolean("+", (made.vertices, made.triangles, group, list(names)), simpler=share * step)
+        closed = Surface(result["vertices"] + middle, result["triangles"], name)
+        if not (len(repeated_triangles(closed.welded[1])) or len(closed.crossings())):
+            break
     lost = [names[g] for g in range(1, len(names)) if not (result["groups"] == g).any()]
     if lost:
         raise InputError(
@@ -110,8 +115,7 @@ def wrapped(
             "leave out that group or its file, or use a smaller wrap"
         )
     off = samples.distance(result["vertices"]).max()
-    made = Surface(result["vertices"] + middle, result["triangles"], name)
-    return made, result["groups"], names, f"wrapped, at most {off:.3g} away from what was given"
+    return closed, result["groups"], names, f"wrapped, at most {off:.3g} away from what was given"
 
 
 def _grid_around(surface: Surface, reach: float) -> _Sampled:

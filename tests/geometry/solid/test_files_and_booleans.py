@@ -5,6 +5,7 @@ import pytest
 
 from clvoro import Box, Solid
 from clvoro.errors import InputError, MismatchWarning
+from clvoro.geometry.solid import wrapping
 
 CUBE = Solid.box((0, 0, 0), (1, 1, 1))
 V, T = CUBE.surface.vertices, CUBE.surface.triangles
@@ -216,6 +217,12 @@ def test_a_wrap_is_closed_around_all_triangles(vertices, triangles, wrap, volume
     given = vertices[np.unique(triangles)]
     assert solid.contains(given).all()
     assert solid.boundary_distance(given).min() > 0.06
+
+
+@pytest.mark.filterwarnings("ignore::clvoro.errors.MismatchWarning")
+def test_a_wrap_that_would_cross_itself_keeps_more_triangles(monkeypatch):
+    monkeypatch.setattr(wrapping, "_SIMPLER", (2.0, 0.1))
+    assert Solid(V, T[2:], wrap=0.2).measure == pytest.approx(1, rel=0.1)
 
 
 COPY = {"groups": np.arange(13) // 12, "group_names": ["a", "b"]}
