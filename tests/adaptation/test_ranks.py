@@ -488,9 +488,11 @@ def test_parts_with_other_input_are_refused(ctx, name, shown):
     def work(peers):
         adapter, errors = clvoro.Adapter(ctx, comm=peers), InputError if peers.number == 0 else RankError
         changed = {"seed": peers.number, "points": [(0.5, 0.2 + 0.1 * peers.number)], "size": 0.2 - 0.1 * peers.number}
+        call = partial(adapter.run, clvoro.Box((0, 0), (1, 1)), **{"size": 0.2, name: changed.get(name)})
+        if name == "case":
+            call = partial(peers.agree, lambda: None, lambda _: {"case": f"[run]\n{peers.number}"})
         with pytest.raises(errors, match=f"rank 1 of 2 has {shown}"):
-            peers.agree(lambda: None, lambda _: {"case": f"[run]\n{peers.number}"} if name == "case" else {})
-            adapter.run(clvoro.Box((0, 0), (1, 1)), **{"size": 0.2, name: changed.get(name)})
+            call()
 
     Team(2).run(work)
 
