@@ -68,8 +68,8 @@ class MeshOutput:
         Returns
         -------
         Diagram or Result
-            That of a result has sizes, errors and quality of the cells that are left, and no history. The same mesh if
-            all cells are left.
+            That of a result has sizes, errors and quality of the cells that are left, as has the last row of its
+            history. The same mesh if all cells are left.
 
         Raises
         ------

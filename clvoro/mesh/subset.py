@@ -16,7 +16,7 @@ from ..geometry.sphere import COAST, Sphere, SphereRegion
 from ..geometry.subdomain import Subdomain
 from ..geometry.surface import Surface
 from .diagram import Diagram
-from .results import HISTORY_DTYPE, Result, figures
+from .results import Result, figures
 
 Mesh = TypeVar("Mesh", Result, Diagram)
 
@@ -38,9 +38,8 @@ def take_subset(mesh: Mesh, keep: object, boundary: str | np.ndarray) -> Mesh:
     part = make(diagram, kept, boundary)
     if not isinstance(mesh, Result):
         return cast("Mesh", part)
-    made = _result_of(mesh, part, kept)
     reason = f"{len(part)} of {len(kept)} cells; {mesh.stop_reason}"
-    return cast("Mesh", dataclasses.replace(made, history=np.zeros(0, HISTORY_DTYPE), stop_reason=reason))
+    return cast("Mesh", dataclasses.replace(_result_of(mesh, part, kept), stop_reason=reason))
 
 
 def _within(shape: Domain | Surface, diagram: Diagram) -> np.ndarray:
@@ -65,9 +64,13 @@ def _result_of(mesh: Result, part: Diagram, kept: np.ndarray) -> Result:
     """Return `mesh` with the diagram `part`, which has the cells `kept` (n,) bool."""
     taken = {name: getattr(mesh, name)[kept] for name in ("target_size", "size_error", "quality")}
     origin = None if mesh.origin is None else mesh.origin[kept]
-    return dataclasses.replace(
-        mesh, points=part.points, diagram=part, **taken, initial=None, final=None, origin=origin, parts=None
-    )
+    history = mesh.history.copy()
+    if len(history):
+        last = {"cells": len(part), "deleted": history["deleted"][-1] + np.count_nonzero(~kept)}
+        for name, value in (last | figures(taken["size_error"], taken["quality"])).items():
+            history[name][-1] = value
+    more = {"origin": origin, "history": history, "initial": None, "final": None, "parts": None}
+    return dataclasses.replace(mesh, points=part.points, diagram=part, **taken, **more)
 
 
 def without_holes(mesh: Result) -> Result:
@@ -77,11 +80,6 @@ def without_holes(mesh: Result) -> Result:
         return mesh
     inside = holes.hole_of(mesh.points)
     made = _result_of(mesh, _in_space(mesh.diagram, inside < 0, holes.names_of(inside)), inside < 0)
-    history = mesh.history.copy()
-    last = {"cells": len(made.points), "deleted": history["deleted"][-1] + np.count_nonzero(inside >= 0)}
-    for name, value in (last | figures(made.size_error, made.quality)).items():
-        history[name][-1] = value
-    made = dataclasses.replace(made, history=history)
     faces, domain = made.diagram.faces, made.diagram.domain
     cut = np.flatnonzero(faces.neighbor < 0)
     cut = cut[domain.removed_behind(-1 - faces.neighbor[cut])]
