@@ -418,7 +418,7 @@ class Job:
         domain = self.case.domain
         if main.initial is None or main.history["level"][0] > 0:
             return None  # there was no step, or the first level was not the finest
-        if domain.curved_walls or domain.sheets is not None:
+        if main.diagram.has_moved_vertices:
             return None  # walls of so irregular cells take longer than the run
         points = np.clip(main.initial.points, domain.lower, domain.upper)
         return adapter.run(domain, size, points=points, method="lloyd", max_steps=0)

@@ -105,12 +105,14 @@ def read_geojson(source: Any) -> tuple[Any, str]:
     text = source if isinstance(source, str) and source.lstrip().startswith("{") else None
     if text is None:
         name = str(source)
+        if (suffix := Path(source).suffix.lower()) in (*FOREIGN, ".csv"):
+            array = "pass points as an array, as numpy.loadtxt reads it"
+            shape = "pass geopandas.read_file(path).union_all(), for a polygon by Polygon.from_shapely, or convert it"
+            raise InputError(f"{name} is a {suffix} file, expected GeoJSON; {array if suffix == '.csv' else shape}")
         try:
             text = read_text(source, LONGEST_GEOMETRY)
         except (OSError, UnicodeDecodeError) as error:
-            foreign = Path(source).suffix.lower() in FOREIGN
-            hint = "; write Polygon.from_shapely(geopandas.read_file(path).union_all())"
-            raise InputError(f"cannot read {name} ({error}), expected GeoJSON{hint if foreign else ''}") from error
+            raise InputError(f"cannot read {name} ({error}), expected GeoJSON") from error
     try:
         return json.loads(text), name
     except (ValueError, RecursionError) as error:

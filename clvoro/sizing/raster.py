@@ -392,7 +392,8 @@ def check_box(
     Raises `InputError` if they do not match the shape, or are not in order.
     """
     if len(shape) not in (2, 3) or 0 in shape:
-        raise InputError(f"{what} values have shape {shape}, expected (ny, nx) or (nz, ny, nx), not empty")
+        hint = "" if shape else "; a file is read first, as by rasterio.open(path).read(1)[::-1]"
+        raise InputError(f"{what} values have shape {shape}, expected (ny, nx) or (nz, ny, nx), not empty{hint}")
     low, high = (np.asarray(c, dtype=float) for c in (lower, upper))
     d = len(shape)
     if low.shape != (d,) or high.shape != (d,):

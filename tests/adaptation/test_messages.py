@@ -67,6 +67,10 @@ def test_shapefiles(tmp_path) -> None:
         clvoro.Polygon.from_geojson(path)
     with pytest.raises(ClvoroError, match=r"expected GeoJSON$"):
         clvoro.Polygon.from_geojson(tmp_path / "lake.json")
+    with pytest.raises(ClvoroError, match=r"wells\.csv is a \.csv file, expected GeoJSON; pass points as an array"):
+        clvoro.adapt(clvoro.Box((0, 0), (1, 1)), 0.5, fixed="wells.csv")
+    with pytest.raises(ClvoroError, match=r"a file is read first, as by rasterio\.open"):
+        clvoro.sizing.Raster("dem.tif", (0, 0), (1, 1))
 
 
 def test_arrays_of_the_diagram(mesh) -> None:
