@@ -348,6 +348,8 @@ def test_cures_keep_cells_closed_and_cuts_their_volume(ctx):
     assert count["cuts"] > 5
     assert count["halves"] > 5
     assert count["unions"] > 0
+    cures.strictly = True
+    assert min(gain for gain, *_ in cures._judged(edits, list(cures.slides(edits, cell))))[1] < -1  # less oblique
 
 
 def test_a_cut_makes_two_convex_cells_of_one(ctx):

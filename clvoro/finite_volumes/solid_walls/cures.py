@@ -39,6 +39,8 @@ _SMALL = 0.4
 """Cells with a smaller volume, over h^3, may be merged with a neighbor; new parts of cells always may."""
 _TURNS = (0.3, 0.6, 1.0)
 """Shares of the angle by which oblique faces are turned."""
+_SLIDES, _SKEWED = (-0.3, -0.15, 0.15, 0.3, 0.5), 0.9
+"""Shares of an edge by which its first end moves to the second one; skewness, see `_facing`, from which it may."""
 _REACH = 0.3
 """Largest distance over h of a crease or corner onto which a vertex may be moved."""
 _SLIVER, _TIP, _FEW = 0.05, 0.4, 4
@@ -65,6 +67,8 @@ Gain = tuple[int, float, float]
 """Change of the number of rejected cells, and of their excess; the worst measure after it. See `judge`."""
 Option = tuple[Gain, Edits, list[int]]
 """What a cure gains, its changes, and which of the cells that they touch are rejected after it."""
+_Facing = tuple[tuple[int, ...], np.ndarray, np.ndarray, np.ndarray, float]
+"""What is asked of a face to another cell; see `Cures._facing`."""
 
 
 class Cures:
@@ -133,7 +137,7 @@ class Cures:
         if self.excess[cell][1] == 0:
             return False
         self.judged, self.concave = {}, {}
-        for last in (False,) if self.strictly else (False, True):
+        for last in (False, True):
             self.searches += 1
             if (found := self._best(edits, cell, _AHEAD, last)) is not None:
                 edits.take(found[1])
@@ -185,7 +189,7 @@ class Cures:
         """Return the best cure of a cell: what it gains, and the changes; None if no cure helps.
 
         Up to `ahead` cures of other cells may follow one that does not help by itself. With `last` cures are also
-        tried that leave out a crease or a part of the solid.
+        tried that leave out a crease or a part of the solid, or slide corners of oblique and skewed faces.
         """
         options = self._options(edits, cell, last)
         if not options:
@@ -211,7 +215,7 @@ class Cures:
             if self.strictly:
                 cures = [self.collapses, self.tilts, self.mergers, self.joins]
             if last:
-                cures = [self.unions, self.losses]
+                cures = [self.slides] if self.strictly else [self.unions, self.losses]
             self.judged[edits, cell, last] = self._judged(edits, [t for cure in cures for t in cure(edits, cell)])
         options = self.judged[edits, cell, last]
         return self._options(edits, cell, False) + options if last else options
@@ -364,17 +368,7 @@ class Cures:
 
     def tilts(self, edits: Edits, cell: int) -> Iterator[Edits]:
         """Turn an oblique face of a cell, about its center or a corner, towards the line through both centroids."""
-        faces = edits.faces_of(cell)
-        beyond = [n for n in (edits.across(k, cell) for k in faces) if n >= 0 and not edits.is_vast(n)]
-        center, *centers = edits.middles([(edits, n) for n in (cell, *beyond)])[:, :3]
-        center_of = dict(zip(beyond, centers, strict=True))
-        for k in faces:
-            other, loop = edits.across(k, cell), edits.seen(k, cell)
-            if other not in center_of:
-                continue
-            x = edits.positions(loop)
-            normal, line = area_of(x), center_of[other] - center
-            normal, line = normal / np.linalg.norm(normal), line / np.linalg.norm(line)
+        for loop, x, normal, line, _ in self._facing(edits, cell):
             if normal @ line > math.cos(math.radians(WANTED_ANGLE)):
                 continue
             # One row for each share and pivot.
@@ -390,6 +384,42 @@ class Cures:
                 for i in np.flatnonzero(fit).tolist():
                     trial.move(cells[i], loop[i], place[i])
                 yield trial
+
+    def slides(self, edits: Edits, cell: int) -> Iterator[Edits]:
+        """Move one corner of an oblique or skewed face along an edge of the cell, or beyond its own end of the edge."""
+        bad = set[int]()
+        for loop, _, normal, line, skewness in self._facing(edits, cell):
+            if normal @ line < math.cos(math.radians(WANTED_ANGLE)) or skewness > _SKEWED:
+                bad.update(loop)
+        edges = sorted({e for k in edits.faces_of(cell) for e in edges_of(edits.seen(k, cell)) if e[0] in bad})
+        if not edges:
+            return
+        x, y = (edits.positions(ends)[:, None] for ends in zip(*edges, strict=True))
+        walls = {v: edits.patches_at(cell, v) for v in bad}
+        moved = (x + np.array(_SLIDES)[:, None] * (y - x)).reshape(-1, 3)
+        vertices = [v for v, _ in edges for _ in _SLIDES]
+        fits, places = self._all_placed([walls[v] for v in vertices], moved, self.h(edits, cell))
+        for k in np.flatnonzero(fits).tolist():
+            trial = edits.trial()
+            trial.move(edits.faces_at(cell, vertices[k]).keys(), vertices[k], places[k])
+            yield trial
+
+    def _facing(self, edits: Edits, cell: int) -> Iterator[_Facing]:
+        """Return what is asked of each face to another cell: (corners, places, normal, line, skewness).
+
+        `line` is the direction of the line through both centroids. The skewness is about that of OpenFOAM: how far the
+        line passes from the mean of the corners, over the largest distance of a corner from it.
+        """
+        beyond = [(k, n) for k in edits.faces_of(cell) if (n := edits.across(k, cell)) >= 0 and not edits.is_vast(n)]
+        center, *centers = edits.middles([(edits, c) for c in (cell, *(n for _, n in beyond))])[:, :3]
+        for (k, _), other in zip(beyond, centers, strict=True):
+            loop = edits.seen(k, cell)
+            x = edits.positions(loop)
+            normal, line, middle = area_of(x), other - center, x.mean(axis=0)
+            normal, line = normal / np.linalg.norm(normal), line / np.linalg.norm(line)
+            off = center + line * ((middle - center) @ normal) / max(line @ normal, 1e-6) - middle
+            reach = np.linalg.norm(x - middle, axis=1).max()
+            yield loop, x, normal, line, float(np.linalg.norm(off) / reach)
 
     def unions(self, edits: Edits, cell: int) -> Iterator[Edits]:
         """Join two wall polygons that meet at a concave edge; the ends of the edge stay, or are left out."""
