@@ -660,8 +660,8 @@ class PartSteps(DomainSteps):
             facing.facts[:, -2:] = told[side // len(self._shifts)]
         self._balls, self._limits = answers.balls, np.column_stack(self._limits_of(answers.balls, answers.facing))
         # A room without limit is that of a generator that all parts know.
-        finite = np.where(np.isinf(self._limits), 0, self._limits)[self._chunks.order]
-        self._most = np.maximum.reduceat(finite, self._chunks.firsts, axis=0)
+        finite = [np.where(np.isinf(limits), 0, limits)[self._chunks.order] for limits in self._limits.T]
+        self._most = np.column_stack([np.maximum.reduceat(limits, self._chunks.firsts) for limits in finite])
         self._send_limits(answers.balls.centers)
 
     def _ask(self, x: np.ndarray, radii: np.ndarray, needed: np.ndarray) -> Answers:
