@@ -1,13 +1,14 @@
 """Runs over the ranks of MPI: bits, sizes and shapes, processor time, and what ranks exchange.
 
     python bench/parallel.py [--ranks 1,2,4,8] [--cells 10000] [--dims 2,3] [--effort fast] [--periodic]
-                             [--sphere] [--polygon] [--device NAME] [--dtype float32] [--json]
+                             [--sphere] [--polygon] [--random] [--device NAME] [--dtype float32] [--json]
+    python bench/parallel.py --model [--cells 1e7] [--json]
 
 For each number of ranks the script starts itself under `mpiexec`; with PoCL each rank has one core. `bits` says whether
 the diagram of random points has the same bits as with the first number of ranks. The other columns are of a run in a
-box, on a sphere, or in a lake, with sizes from h to 3 h, after the same run once, which loads kernels. `CPU s` is
-the processor time of its work, summed over ranks, `host` the part of it that is not kernels and copies on the device,
-and `over one` the ratio of `CPU s` to that of the first number of ranks.
+box, on a sphere, or in a lake, with sizes from h to 3 h, after the same run once, which loads kernels; with `--random`
+it begins with random generators. `CPU s` is the processor time of its work, summed over ranks, `host` the part of it
+that is not kernels and copies on the device, and `over one` the ratio of `CPU s` to that of the first number of ranks.
 `waiting` is the processor time of waits for other ranks, which ask and sleep by turns; ranks with a core of their own
 wait less. `reading` is that of reading the cells afterwards. `floor` is the ratio for as many processes at the same
 time that each make a mesh of n / p cells without messages: it has the cost of the fixed work of a step, and of shared
@@ -16,10 +17,14 @@ between pairs of ranks, and of sums over all ranks, per step in which all ranks 
 same time; `waits` counts how often a rank waits for others. `ghosts` is the number of ghosts of rank 0 in the last
 diagram over 2 d (n / p)^((d - 1) / d), an estimate of one layer of cells around a part. `over least` is the number of
 ghosts of all ranks over the least possible one: the neighbors of own cells, without which these are unknown, and in 2D
-the neighbors of these, as the cells of ghosts beside own ones must be known, too. `one round` is the share of
+the neighbors of these, as the cells of ghosts beside own ones must be known, too. `proof` is the same ratio for those
+ghosts that prove that all cells are final; the others are room to move. `one round` is the share of
 diagrams whose cells were made once, since no ghosts were missing, and `asked` how often ranks asked each other for all
 ghosts anew, over the number of diagrams. `memory` is the largest device memory of a rank, in the run and while its
 cells are read, over that of the first number of ranks. Needs `pip install -e '.[mpi]'`.
+
+`--model` measures nothing: it prints the time of a step on up to 1,000 GPUs with so many cells each, by `MODEL`. Runs
+themselves end at 2e9 cells, the limit of 32-bit labels.
 """
 
 from __future__ import annotations
@@ -32,6 +37,7 @@ import os
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 from _common import Report, counts, parser, run_ranks, shown
@@ -41,7 +47,9 @@ import clvoro
 from clvoro.adaptation.run import Run
 from clvoro.opencl import memory_limits
 from clvoro.opencl.peers import Ranks
-from clvoro.tessellation.part_steps import PartSteps
+from clvoro.tessellation.device_diagram import Tessellation
+from clvoro.tessellation.part import Part
+from clvoro.tessellation.part_steps import NOISE, PartSteps, inside
 
 COLUMNS = {
     "ranks": shown("ranks", "d"),
@@ -60,10 +68,40 @@ COLUMNS = {
     "waits": shown("waits", ".0f"),
     "ghosts": shown("ghosts", ".2f"),
     "over least": shown("over_least", ".2f"),
+    "proof": shown("proof", ".2f"),
     "one round": shown("one_round", ".0%"),
     "asked": shown("asked", ".0%"),
     "memory": shown("memory", ".3f"),
 }
+
+MODEL = {2: (4.0e8, 22, 16, 8, 3.8), 3: (1.14e7, 22, 19, 26, 2.9)}
+"""Of a step, by the dimension: cells that an H200 does in a second ("On a GPU" in RESULTS.md; in 3D those of an update,
+most of a step); exchanges, and sums, as in the table "Ranks"; assumed neighbors of a part; measured ghosts over one
+layer around a part."""
+BANDWIDTH, LATENCY, COPY, SEARCH, STEPS = 2.5e10, 2e-6, 5.7e-5, 2e-7, 5
+"""Assumed: bytes in a second, over the network and between host and device; seconds of a message. Measured: seconds of
+a copy between an H200 and its host; of the search for ghosts on the host, for each cell; steps between searches."""
+MODEL_COLUMNS = {
+    "GPUs": shown("parts", ",d"),
+    "cells": shown("cells", ".1e"),
+    "ghosts": shown("ghosts", ".1%"),
+    **{f"{name} ms": shown(name, ".0f", 1e3) for name in ("compute", "bytes", "latency", "search")},
+    "efficiency": shown("efficiency", ".2f"),
+}
+
+
+def model(dim: int, own: float, parts: int) -> dict[str, float]:
+    """Return the seconds of a step on so many `parts`, each with `own` cells and a GPU."""
+    rate, exchanges, sums, neighbors, layers = MODEL[dim]
+    ghosts = 2 * dim * own ** ((dim - 1) / dim) * layers if parts > 1 else 0.0
+    # Values of 8 bytes go to the host, over the network and to the device; positions once, of 8 bytes for each axis.
+    moved = 3 * 8 * ghosts * (exchanges + dim - 1) / BANDWIDTH
+    waits = exchanges * (neighbors * LATENCY + 2 * COPY) + sums * (2 * np.log2(parts) * LATENCY + 2 * COPY)
+    of_step = {"compute": (own + ghosts) / rate, "bytes": moved, "latency": waits, "search": own * SEARCH / STEPS}
+    if parts == 1:
+        of_step |= dict.fromkeys(("bytes", "latency", "search"), 0.0)
+    shares = {"ghosts": ghosts / own, "efficiency": own / rate / sum(of_step.values())}
+    return {"parts": parts, "cells": own * parts, **of_step, **shares}
 
 
 def least_ghosts(whole: clvoro.Result, labels: list[np.ndarray], layers: int) -> int:
@@ -80,13 +118,24 @@ def least_ghosts(whole: clvoro.Result, labels: list[np.ndarray], layers: int) ->
     return found
 
 
+def proving(steps: PartSteps, part: Part, t: Tessellation) -> int:
+    """Return how many ghosts prove that the cells of `t`, the diagram of `part`, are final."""
+    engine, n, count = steps.stages.engine, part.n_own, part.n_own + len(steps._rows)
+    part = replace(part, count=count, points=part.points[:count])
+    needed = engine.empty((n, 2), np.float32)
+    given = steps._at, steps._limits_there, 2 * (1 + NOISE[engine.real.name]), steps._reads_rows
+    part.sums(engine, t, *given, needed, steps._periods)
+    x = part.points.get().astype(float)
+    return np.count_nonzero(inside(x[n:], np.column_stack([x[:n], needed.get()[:, 0]])))
+
+
 def measure_rank(options: argparse.Namespace) -> None:
     """Print the figures of all ranks as JSON, on rank 0."""
     from mpi4py import MPI
 
     os.environ.setdefault(memory_limits.VARIABLE, "1024GiB")  # the memory is counted
     dim, cells, effort, comm = options.rank, options.cells, options.effort, MPI.COMM_WORLD
-    rounds, ghosts, asked, waited = [], [0], [0], [0.0]
+    rounds, last_made, asked, waited = [], [], [0], [0.0]
     box = clvoro.Box((0,) * dim, (1,) * dim, periodic=options.periodic)
     domain = clvoro.Sphere(0.5) if options.sphere else COAST if options.polygon else box
     x, dim = np.random.default_rng(1).random((cells, dim)) - 0.5 * options.sphere, domain.cell_dim
@@ -101,7 +150,7 @@ def measure_rank(options: argparse.Namespace) -> None:
         asked[0] += steps.asked > before
         if found is not None:
             rounds.append(steps.rounds)
-            ghosts[0] = part.count - part.n_own
+            last_made[:] = steps, part, *given
         return found
 
     def timed(wait: Callable[..., object]) -> Callable[..., object]:
@@ -127,7 +176,7 @@ def measure_rank(options: argparse.Namespace) -> None:
     for name in ("neighbors", "volumes", "centroids", "face_measures") if found is not None else ():
         digest.update(np.ascontiguousarray(getattr(found, name)))
     factor = {2: 2 / 3, 3: (13 / 27) ** 0.5}[dim]
-    h = factor * (domain.measure / cells) ** (1 / dim)
+    finest = h = factor * (domain.measure / cells) ** (1 / dim)
 
     def run(by: clvoro.Adapter, h: float) -> tuple[clvoro.Result, np.ndarray]:
         """Return the mesh, and processor time over all ranks: of work, of its part on the host, of waits."""
@@ -137,13 +186,14 @@ def measure_rank(options: argparse.Namespace) -> None:
 
         comm.Barrier()
         began = clocks()
-        mesh = by.run(domain, lambda p: h * (1 + 2 * (p[:, 0] - domain.lower[0])), effort)
+        points = x[:: round((h / finest) ** dim)] if options.random else None
+        mesh = by.run(domain, lambda p: h * (1 + 2 * (p[:, 0] - domain.lower[0])), effort, points=points)
         return mesh, comm.allreduce(clocks() - began)
 
     run(adapter, h)
     single = clvoro.Adapter(adapter.ctx, options.dtype, comm=MPI.COMM_SELF)
     run(single, 4 * h)
-    least = run(single, h * comm.size ** (1 / dim))[1][0]
+    alone = run(single, h * comm.size ** (1 / dim))[1][0]
     rounds.clear()
     calls.clear()
     asked[0] = 0
@@ -155,7 +205,8 @@ def measure_rank(options: argparse.Namespace) -> None:
     _ = [getattr(mesh.diagram, name) for name in clvoro.Diagram._NAMES if name in dir(mesh.diagram)]
     reading = comm.allreduce(time.process_time() - began)
     taken = comm.allreduce(max(memory_limits.MOST_TAKEN.values()), MPI.MAX)
-    of_rank_0, of_all = ghosts[0], comm.allreduce(ghosts[0])
+    ghosts = len(last_made[0]._rows) if comm.size > 1 else 0
+    of_all, proof = comm.allreduce(np.array([ghosts, proving(*last_made) if comm.size > 1 else 0]))
     whole, labels = mesh.gather(), comm.gather(mesh.parts.labels if mesh.parts else np.arange(len(mesh)))
     steps = int(mesh.history["step"][-1])
     per_part = mesh.history["cells"][-1] / comm.size
@@ -163,6 +214,7 @@ def measure_rank(options: argparse.Namespace) -> None:
     if comm.rank == 0:
         last, together = mesh.history[-1], np.array([row[1:] for row in calls if row[0]])
         done, exchanges, reductions, halts = together[-1] - together[0]
+        least = max(least_ghosts(whole, labels, 4 - dim), 1)
         figures = {
             "ranks": comm.size,
             "cells": int(last["cells"]),
@@ -172,13 +224,14 @@ def measure_rank(options: argparse.Namespace) -> None:
             "host": host,
             "waiting": waits,
             "reading": reading,
-            "least": least,
+            "least": alone,
             "iterations": float(mesh.history["iterations"].sum() / steps),
             "exchanges": exchanges / done,
             "reductions": reductions / done,
             "waits": halts / done,
-            "ghosts": of_rank_0 / layer,
-            "over_least": float(of_all / max(least_ghosts(whole, labels, 4 - dim), 1)),
+            "ghosts": ghosts / layer,
+            "over_least": float(of_all / least),
+            "proof": float(proof / least),
             "one_round": float(np.mean(np.array(rounds) == 1)) if comm.size > 1 else 1.0,
             "taken": float(taken),
             "asked": asked[0] / len(rounds) if comm.size > 1 else 0.0,
@@ -190,14 +243,24 @@ def main() -> None:
     """Measure each number of ranks, and print a table for each dimension."""
     p = parser(__doc__)
     p.add_argument("--ranks", type=counts, default=[1, 2, 4, 8], help="numbers of ranks")
-    p.add_argument("--cells", type=int, default=10_000, help="number of cells")
+    p.add_argument("--cells", type=float, help="number of cells: by default 10,000, and 1e7 for each GPU of the model")
     p.add_argument("--dims", type=counts, default=[2, 3], help="dimensions")
     p.add_argument("--effort", default="fast", help="effort of the run")
     p.add_argument("--periodic", action="store_true", help="a box without walls")
     p.add_argument("--sphere", action="store_true", help="a sphere in place of boxes")
     p.add_argument("--polygon", action="store_true", help="a lake in place of boxes")
+    p.add_argument("--random", action="store_true", help="begin with random generators")
     p.add_argument("--rank", type=int, help="dimension for which each rank measures; used by the script itself")
+    p.add_argument("--model", action="store_true", help="print the model of a step on many GPUs")
     options = p.parse_args()
+    options.cells = int(options.cells or (1e7 if options.model else 1e4))
+    for dim in options.dims if options.model else ():
+        table = Report(options.json, MODEL_COLUMNS)
+        for parts in (1, 8, 64, 1000):
+            table.add(model(dim, options.cells, parts))
+        table.finish(f"Model of a step in {dim}D")
+    if options.model:
+        return
     if options.rank:
         measure_rank(options)
         return

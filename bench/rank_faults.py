@@ -3,7 +3,8 @@
     python bench/rank_faults.py [--times 100] [--ranks 3] [--seed 1] [--json]
 
 Each time `mpiexec` starts ``clvoro run`` over ranks, with a checkpoint after each step. The last rank fails: it is
-killed, its callback raises an error, its disk is full (RLIMIT_FSIZE), or it has another version or another case.
+killed, its callback raises an error, its disk is full (RLIMIT_FSIZE), its device stops to build kernels, or it has
+another version or another case.
 `longest s` is the longest time from the fault to the end of `mpiexec`. It is not measured on a full disk, since the run
 then goes on without checkpoints and fails at its end. `most messages` is the largest number of lines "clvoro: ..." on
 the standard error of one run; `without` counts the runs that print none, as where a process is killed. `checkpoints`
@@ -22,16 +23,18 @@ import sys
 import tempfile
 import time
 from pathlib import Path
+from typing import Any
 
 from _common import Report, parser, run_ranks, shown
 
 from clvoro.adaptation.checkpoint import Saved
 from clvoro.adaptation.run import Run
 from clvoro.cli import main as command
-from clvoro.errors import ClvoroError
+from clvoro.errors import BuildError, ClvoroError
 from clvoro.opencl import peers as parts
+from clvoro.opencl import program
 
-KINDS = ("kill", "error", "full disk", "version", "input")
+KINDS = ("kill", "error", "full disk", "device", "version", "input")
 COLUMNS = {
     "fault": shown("fault", "s"),
     "times": shown("times", "d"),
@@ -64,6 +67,17 @@ def run_rank(folder: Path, kind: str, step: int) -> None:
 
     if fault in ("version", "input"):
         note()
+    if fault == "device":
+        built, from_now = program.build_program, [step]
+
+        def build(*given: Any) -> Any:
+            from_now[0] -= 1
+            if from_now[0] < 0:
+                note()
+                raise BuildError("the compiler is gone")
+            return built(*given)
+
+        program.build_program = build
     if fault == "version":
         parts.__version__ = "0"
 
