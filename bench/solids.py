@@ -136,7 +136,7 @@ def draw(result: clvoro.Result, path: Path, title: str) -> None:
     from clvoro.plotting.solids import plot_cutaway
 
     path.parent.mkdir(parents=True, exist_ok=True)
-    regions = result.diagram.cell_region if len(result.diagram.region_names) else None
+    regions = result.diagram.cell_region if len(result.diagram.region_names) > 1 else None
     figure = plot_cutaway(result, "quality" if regions is None else regions, walls=regions is None, title=title)
     figure.savefig(path, dpi=150, bbox_inches="tight")
 

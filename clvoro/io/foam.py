@@ -73,7 +73,7 @@ _ENDS = (("Min", "Max"), ("Max", "Min"))
 PatchType = Literal["wall", "patch", "symmetry", "symmetryPlane"]
 """Types of patches for `poly_mesh`."""
 _OPEN_PARTS = ("inlet", "outlet", "inflow", "outflow", "farfield", "freestream", "atmosphere")
-_OPEN_WORDS = {"open", "opening", "openings"}
+_OPEN_WORDS = {"open", "opening", "openings", "in", "out"}
 """Parts of a name, and whole words in it, that say that a fluid crosses the boundary."""
 
 
@@ -143,7 +143,7 @@ def default_type(name: str) -> PatchType:
 
     Examples
     --------
-    >>> [default_type(name) for name in ("inlet", "left_outlet2", "farField", "ocean-open", "inletWall", "xMin")]
+    >>> [default_type(name) for name in ("inlet", "left_outlet2", "farField", "out2", "inletWall", "xMin")]
     ['patch', 'patch', 'patch', 'patch', 'wall', 'wall']
     """
     words = [word.lower() for word in re.findall(r"[A-Z]?[a-z]+|[A-Z]+", name)]
