@@ -90,6 +90,7 @@ class Given:
         ("sphere", "float64", None),
         ("sphere", "float32", 16),
         ("ball", "float64", None),
+        ("ball", "float32", 16),
     ],
     ids=lambda p: f"{p[0]}, {p[1]}" + (", groups" if p[2] else ""),
 )
