@@ -9,19 +9,17 @@ the diagram of random points has the same bits as with the first number of ranks
 box, on a sphere, or in a lake, with sizes from h to 3 h, after the same run once, which loads kernels; with `--random`
 it begins with random generators. `CPU s` is the processor time of its work, summed over ranks, `host` the part of it
 that is not kernels and copies on the device, and `over one` the ratio of `CPU s` to that of the first number of ranks.
-`waiting` is the processor time of waits for other ranks, which ask and sleep by turns; ranks with a core of their own
-wait less. `reading` is that of reading the cells afterwards. `floor` is the ratio for as many processes at the same
-time that each make a mesh of n / p cells without messages: it has the cost of the fixed work of a step, and of shared
-cores and caches. `exchanges` and `reductions` are the rounds of messages
-between pairs of ranks, and of sums over all ranks, per step in which all ranks work. Some of both take place at the
-same time; `waits` counts how often a rank waits for others. `ghosts` is the number of ghosts of rank 0 in the last
-diagram over 2 d (n / p)^((d - 1) / d), an estimate of one layer of cells around a part. `over least` is the number of
-ghosts of all ranks over the least possible one: the neighbors of own cells, without which these are unknown, and in 2D
-the neighbors of these, as the cells of ghosts beside own ones must be known, too. `proof` is the same ratio for those
-ghosts that prove that all cells are final; the others are room to move. `one round` is the share of
-diagrams whose cells were made once, since no ghosts were missing, and `asked` how often ranks asked each other for all
-ghosts anew, over the number of diagrams. `memory` is the largest device memory of a rank, in the run and while its
-cells are read, over that of the first number of ranks. Needs `pip install -e '.[mpi]'`.
+`waiting` is the processor time of waits for other ranks, which ask and sleep by turns. `floor` is the ratio for as many
+processes at the same time that each make a mesh of n / p cells without messages. `exchanges` and `reductions` are the
+rounds of messages between pairs of ranks, and of sums over all ranks, per step in which all ranks work; `waits` counts
+how often a rank waits for others, as some of both take place at the same time. `ghosts` is the number of ghosts of rank
+0 in the last diagram over 2 d (n / p)^((d - 1) / d), an estimate of one layer of cells around a part, and `over least`
+that of all ranks over the least possible one: the neighbors of own cells, and in 2D the neighbors of these, as the
+cells of ghosts beside own ones must be known, too. `proof` is the same ratio for those ghosts that prove that all cells
+are final; the others are room to move. `one round` is the share of diagrams whose cells were made once, since no ghosts
+were missing, and `asked` how often ranks asked each other for all ghosts anew, over the number of diagrams. `memory` is
+the largest device memory of a rank, in the run and while its cells are read, over that of the first number of ranks.
+Needs `pip install -e '.[mpi]'`.
 
 `--model` measures nothing: it prints the time of a step on up to 1,000 GPUs with so many cells each, by `MODEL`. Runs
 themselves end at 2e9 cells, the limit of 32-bit labels.
@@ -59,7 +57,6 @@ COLUMNS = {
     "CPU s": shown("cpu", ".1f"),
     "host": shown("host", ".1f"),
     "waiting": shown("waiting", ".1f"),
-    "reading": shown("reading", ".1f"),
     "over one": shown("over_one", ".2f"),
     "floor": shown("floor", ".2f"),
     "iterations": shown("iterations", ".1f"),
@@ -98,8 +95,7 @@ def model(dim: int, own: float, parts: int) -> dict[str, float]:
     moved = 3 * 8 * ghosts * (exchanges + dim - 1) / BANDWIDTH
     waits = exchanges * (neighbors * LATENCY + 2 * COPY) + sums * (2 * np.log2(parts) * LATENCY + 2 * COPY)
     of_step = {"compute": (own + ghosts) / rate, "bytes": moved, "latency": waits, "search": own * SEARCH / STEPS}
-    if parts == 1:
-        of_step |= dict.fromkeys(("bytes", "latency", "search"), 0.0)
+    of_step = of_step if parts > 1 else dict.fromkeys(of_step, 0.0) | {"compute": own / rate}
     shares = {"ghosts": ghosts / own, "efficiency": own / rate / sum(of_step.values())}
     return {"parts": parts, "cells": own * parts, **of_step, **shares}
 
@@ -121,8 +117,7 @@ def least_ghosts(whole: clvoro.Result, labels: list[np.ndarray], layers: int) ->
 def proving(steps: PartSteps, part: Part, t: Tessellation) -> int:
     """Return how many ghosts prove that the cells of `t`, the diagram of `part`, are final."""
     engine, n, count = steps.stages.engine, part.n_own, part.n_own + len(steps._rows)
-    part = replace(part, count=count, points=part.points[:count])
-    needed = engine.empty((n, 2), np.float32)
+    part, needed = replace(part, count=count, points=part.points[:count]), engine.empty((n, 2), np.float32)
     given = steps._at, steps._limits_there, 2 * (1 + NOISE[engine.real.name]), steps._reads_rows
     part.sums(engine, t, *given, needed, steps._periods)
     x = part.points.get().astype(float)
@@ -201,9 +196,7 @@ def measure_rank(options: argparse.Namespace) -> None:
     gc.collect()
     memory_limits.MOST_TAKEN.clear()
     mesh, (spent, host, waits) = run(adapter, h)
-    began = time.process_time()
     _ = [getattr(mesh.diagram, name) for name in clvoro.Diagram._NAMES if name in dir(mesh.diagram)]
-    reading = comm.allreduce(time.process_time() - began)
     taken = comm.allreduce(max(memory_limits.MOST_TAKEN.values()), MPI.MAX)
     ghosts = len(last_made[0]._rows) if comm.size > 1 else 0
     of_all, proof = comm.allreduce(np.array([ghosts, proving(*last_made) if comm.size > 1 else 0]))
@@ -223,7 +216,6 @@ def measure_rank(options: argparse.Namespace) -> None:
             "cpu": spent,
             "host": host,
             "waiting": waits,
-            "reading": reading,
             "least": alone,
             "iterations": float(mesh.history["iterations"].sum() / steps),
             "exchanges": exchanges / done,
@@ -254,12 +246,12 @@ def main() -> None:
     p.add_argument("--model", action="store_true", help="print the model of a step on many GPUs")
     options = p.parse_args()
     options.cells = int(options.cells or (1e7 if options.model else 1e4))
-    for dim in options.dims if options.model else ():
-        table = Report(options.json, MODEL_COLUMNS)
-        for parts in (1, 8, 64, 1000):
-            table.add(model(dim, options.cells, parts))
-        table.finish(f"Model of a step in {dim}D")
     if options.model:
+        for dim in options.dims:
+            table = Report(options.json, MODEL_COLUMNS)
+            for parts in (1, 8, 64, 1000):
+                table.add(model(dim, options.cells, parts))
+            table.finish(f"Model of a step in {dim}D")
         return
     if options.rank:
         measure_rank(options)
