@@ -98,31 +98,37 @@ def dirty() -> trimesh.Trimesh:
     return trimesh.Trimesh(corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3), process=False)
 
 
-SHAPES: dict[str, tuple[Callable[[], trimesh.Trimesh], tuple[float, float]]] = {
-    "cube": (lambda: block((0, 0, 0), (1, 1, 1)), (0.15, 0.075)),
-    "L": (lambda: minus(block((0, 0, 0), (2, 2, 1)), block((1, 1, -1), (3, 3, 2))), (0.25, 0.125)),
-    "Fichera corner": (lambda: minus(block((-1, -1, -1), (1, 1, 1)), block((0, 0, 0), (2, 2, 2))), (0.25, 0.15)),
-    "hole": (lambda: minus(block((-1, -1, 0), (1, 1, 1)), tube((0, 0, -1), (0, 0, 2), 0.5)), (0.2, 0.12)),
-    "cylinder": (lambda: tube((0, 0, 0), (0, 0, 2), 1, 96), (0.25, 0.15)),
-    "cone": (lambda: creation.cone(1, 2, sections=96), (0.25, 0.15)),
-    "torus": (lambda: creation.torus(0.7, 0.3, 128, 64), (0.12, 0.08)),
-    "pipes": (lambda: plus(tube((0, 0, -1.2), (0, 0, 1.2), 0.4), tube((-1, 0, 0), (1, 0, 0), 0.3)), (0.15, 0.09)),
-    "stacked": (lambda: plus(tube((0, 0, -0.6), (0, 0, 0), 1, 96), tube((0, 0, -0.1), (0, 0, 0.6), 0.5)), (0.2, 0.12)),
-    "gear": (gear, (0.1, 0.06)),
-    "plate": (lambda: block((0, 0, 0), (2, 2, 0.3)), (0.15, 0.1)),
-    "outside of a ball": (lambda: minus(block((-2, -2, -2), (2, 2, 2)), creation.icosphere(4)), (0.4, 0.25)),
+SHAPES: dict[str, tuple[Callable[[], trimesh.Trimesh], tuple[float, float, float]]] = {
+    "cube": (lambda: block((0, 0, 0), (1, 1, 1)), (0.15, 0.075, 0.04)),
+    "L": (lambda: minus(block((0, 0, 0), (2, 2, 1)), block((1, 1, -1), (3, 3, 2))), (0.25, 0.125, 0.065)),
+    "Fichera corner": (lambda: minus(block((-1, -1, -1), (1, 1, 1)), block((0, 0, 0), (2, 2, 2))), (0.25, 0.15, 0.08)),
+    "hole": (lambda: minus(block((-1, -1, 0), (1, 1, 1)), tube((0, 0, -1), (0, 0, 2), 0.5)), (0.2, 0.12, 0.06)),
+    "cylinder": (lambda: tube((0, 0, 0), (0, 0, 2), 1, 96), (0.25, 0.15, 0.08)),
+    "cone": (lambda: creation.cone(1, 2, sections=96), (0.25, 0.15, 0.06)),
+    "torus": (lambda: creation.torus(0.7, 0.3, 128, 64), (0.12, 0.08, 0.04)),
+    "pipes": (
+        lambda: plus(tube((0, 0, -1.2), (0, 0, 1.2), 0.4), tube((-1, 0, 0), (1, 0, 0), 0.3)),
+        (0.15, 0.09, 0.045),
+    ),
+    "stacked": (
+        lambda: plus(tube((0, 0, -0.6), (0, 0, 0), 1, 96), tube((0, 0, -0.1), (0, 0, 0.6), 0.5)),
+        (0.2, 0.12, 0.06),
+    ),
+    "gear": (gear, (0.1, 0.06, 0.035)),
+    "plate": (lambda: block((0, 0, 0), (2, 2, 0.3)), (0.15, 0.1, 0.05)),
+    "outside of a ball": (lambda: minus(block((-2, -2, -2), (2, 2, 2)), creation.icosphere(4)), (0.4, 0.25, 0.14)),
     "outside of a cube": (
         lambda: minus(block((-1.2, -1.2, -1.2), (1.2, 1.2, 1.2)), creation.box((1, 1, 1))),
-        (0.25, 0.15),
+        (0.25, 0.15, 0.1),
     ),
-    "outside of a wing": (wing, (0.2, 0.1)),
-    "bracket": (bracket, (0.15, 0.1)),
+    "outside of a wing": (wing, (0.2, 0.1, 0.08)),
+    "bracket": (bracket, (0.15, 0.1, 0.05)),
     "stair": (
         lambda: plus(block((0, 0, 0), (3, 1, 1)), block((1, 0, 0), (3, 2, 1)), block((1, 0, 0), (3, 1, 2))),
-        (0.25, 0.15),
+        (0.25, 0.15, 0.08),
     ),
-    "gyroid": (gyroid, (0.35, 0.12)),
-    "dirty": (dirty, (0.15, 0.1)),
+    "gyroid": (gyroid, (0.35, 0.12, 0.09)),
+    "dirty": (dirty, (0.15, 0.1, 0.05)),
 }
 
 
@@ -136,7 +142,11 @@ def bent_pipe() -> trimesh.Trimesh:
     return creation.sweep_polygon(shapely.Point(0, 0).buffer(0.25, quad_segs=12), path)
 
 
-LAYERED = {**SHAPES, "ball": (lambda: creation.icosphere(4), (0.2, 0.12)), "bent pipe": (bent_pipe, (0.08, 0.05))}
+LAYERED = {
+    **SHAPES,
+    "ball": (lambda: creation.icosphere(4), (0.2, 0.12, 0.07)),
+    "bent pipe": (bent_pipe, (0.08, 0.05, 0.03)),
+}
 """The same and others, for layers along their walls."""
 
 

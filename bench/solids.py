@@ -447,7 +447,7 @@ def main() -> None:
     options_of.add_argument("--runs", default="default", metavar="NAMES", help="efforts, and exact")
     options_of.add_argument("--seeds", type=int, default=1, metavar="N", help="one run with each of 0 to N - 1")
     options_of.add_argument("--worst", action="store_true", help="one row with the worst figures of all runs")
-    options_of.add_argument("--resolutions", default="0,1", metavar="NUMBERS", help="0: coarse, 1: fine")
+    options_of.add_argument("--resolutions", default="0,1", metavar="NUMBERS", help="0: coarse, 1: fine, 2: finest")
     options_of.add_argument("--graded", action="store_true", help="sizes from h / 2 at walls to 2 h")
     options_of.add_argument("--booleans", type=int, default=0, metavar="N", help="random solids in place of those")
     options_of.add_argument(
@@ -465,7 +465,7 @@ def main() -> None:
     shapes: Any = SCENES if options.surfaces else LAYERED if options.layers else SHAPES
     for what, given, known in (
         ("solid", () if options.booleans or options.files else names(options.only), shapes),
-        ("resolution", names(options.resolutions), ("0", "1")),
+        ("resolution", names(options.resolutions), ("0", "1", "2")),
         ("run", names(options.runs), RUNS),
     ):
         if unknown := [name for name in given if name not in known]:
