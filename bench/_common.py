@@ -188,29 +188,20 @@ def figures(diagram: clvoro.Diagram, h: np.ndarray, quality: np.ndarray) -> dict
     if not inner.any():
         inner[:] = True
     sides = np.diff(diagram.neighbor_starts)
-    return {
-        "cells": len(diagram),
-        "mean_error": float(error.mean()),
-        "max_error": float(error.max()),
-        "mean_error_inner": float(error[inner].mean()),
-        "max_error_inner": float(error[inner].max()),
-        "signed_log": float(np.log(length / h).mean()),
-        "mean_quality": float(quality[inner].mean()),
-        "min_quality": float(quality[inner].min()),
-        "mean_quality_all": float(quality.mean()),
-        "min_quality_all": float(quality.min()),
-        "six_sided": float((sides[inner] == 6).mean()),
-        "faces": float(sides[inner].mean()),
-        "mean_deviation": float(deviation.mean()),
-        "max_deviation": float(deviation.max()),
-    }
+    parts = {"error": error, "error_inner": error[inner], "deviation": deviation}
+    found = {f"{how}_{name}": float(getattr(x, how)()) for name, x in parts.items() for how in ("mean", "max")}
+    parts = {"quality": quality[inner], "quality_all": quality}
+    found |= {f"{how}_{name}": float(getattr(x, how)()) for name, x in parts.items() for how in ("mean", "min")}
+    logs, faces, six = np.log(length / h).mean(), sides[inner].mean(), (sides[inner] == 6).mean()
+    return {"cells": len(diagram), **found, "signed_log": float(logs), "faces": float(faces), "six_sided": float(six)}
 
 
 def cell_quality(diagram: clvoro.Diagram) -> np.ndarray:
-    """Return the paper's (4.1) for each cell of a 2D diagram, on the host."""
-    starts = diagram.neighbor_starts
-    sides = np.diff(starts)
-    perimeter = np.add.reduceat(diagram.face_measures, starts[:-1])
+    """Return for each cell the paper's (4.1) in 2D, 36 pi V^2 / S^3 in 3D, on the host."""
+    sides = np.diff(diagram.neighbor_starts)
+    perimeter = np.add.reduceat(diagram.face_measures, diagram.neighbor_starts[:-1])
+    if diagram.points.shape[1] == 3:
+        return 36 * math.pi * diagram.volumes**2 / perimeter**3
     return 4 * diagram.volumes * sides * np.tan(math.pi / sides) / perimeter**2
 
 
@@ -252,6 +243,21 @@ def markdown(header: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
         return "| " + " | ".join(str(c).replace("|", "\\|") for c in cells) + " |"
 
     return "\n".join([line(header), "|" + "---|" * len(header), *(line(row) for row in rows)])
+
+
+def draw_sizes(meshes: list[tuple[Any, dict[str, Any]]], path: Path, extent: tuple[float, float], ratios: Any) -> None:
+    """Draw meshes side by side, colored by their sizes, each with settings of its axes; `extent` is in inches."""
+    from clvoro.plotting import plot_cells
+    from clvoro.plotting.style import new_figure, styled
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with styled():
+        figure = new_figure(*extent)
+        axes = np.atleast_1d(figure.subplots(1, len(meshes), width_ratios=ratios))
+        for ax, (mesh, settings) in zip(axes, meshes, strict=True):
+            plot_cells(mesh, "size", ax=ax, key=False)
+            ax.set(**{"xticks": [], "yticks": [], "xlabel": "", "ylabel": "", **settings})
+        figure.savefig(path, dpi=115)
 
 
 SHAPE_COLUMNS: dict[str, Callable[[dict[str, Any]], object]] = {

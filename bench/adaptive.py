@@ -38,7 +38,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from _common import FIRST_SEED, Report, heading, make_adapter, names, parser, shown
+from _common import FIRST_SEED, Report, draw_sizes, heading, make_adapter, names, parser, shown
 from _remeshers import MESHERS, MissingPeerError, remesh
 from scipy.interpolate import CubicSpline
 from scipy.spatial import ConvexHull, Delaunay
@@ -348,20 +348,6 @@ def adapt(
     return mesh, size, uniform
 
 
-def picture(found: list[tuple[str, clvoro.Result]], path: Path) -> None:
-    """Draw the meshes in the plane side by side."""
-    from clvoro.plotting import plot_cells
-    from clvoro.plotting.style import new_figure, styled
-
-    with styled():
-        figure = new_figure(3.2 * len(found), 3.5)
-        for ax, (name, mesh) in zip(np.atleast_1d(figure.subplots(1, len(found))), found, strict=True):
-            plot_cells(mesh, "size", ax, key=False)
-            ax.set_title(f"{name}: {len(mesh):,} cells", loc="left", fontsize=9)
-            ax.set(xticks=[], yticks=[], xlabel="", ylabel="")
-        figure.savefig(path, dpi=90)
-
-
 COLUMNS = {
     "space": lambda r: r["space"],
     "function": lambda r: r["function"],
@@ -432,8 +418,8 @@ def main(arguments: list[str] | None = None) -> int:
             for row in rows.values():
                 report.add(row, f"{name}, {function}, {row['mesh']}")
     if options.pictures and drawn:
-        options.pictures.mkdir(parents=True, exist_ok=True)
-        picture(drawn, options.pictures / "adaptive.png")
+        panels = [(mesh, {"title": f"{name}: {len(mesh):,} cells"}) for name, mesh in drawn]
+        draw_sizes(panels, options.pictures / "adaptive.png", (3.2 * len(drawn), 3.5), None)
     report.finish(heading(adapter, f"Interpolation error over the isotropic optimum, {options.cells:,} cells"))
     return int(missed)
 

@@ -28,7 +28,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import shapely
 import solver_ready
-from _common import FIRST_SEED, Report, heading, make_adapter, names, off_walls, parser
+from _common import FIRST_SEED, Report, draw_sizes, heading, make_adapter, names, off_walls, parser
 from _openfoam import require
 
 import clvoro
@@ -156,21 +156,6 @@ def measure(result: clvoro.Result, case: Path) -> dict[str, Any]:
     return {**solver_ready.measure(result, case), "low": low, "wall": len(q)}
 
 
-def draw(result: clvoro.Result, place: Place, path: Path) -> None:
-    """Draw a mesh, and beside it a part of it."""
-    from clvoro.plotting.cells import plot_cells
-    from clvoro.plotting.style import new_figure, styled
-
-    with styled():
-        figure = new_figure(7.2, 4.2)
-        for ax in figure.subplots(1, 2, width_ratios=[1, 1.5], squeeze=False)[0]:
-            plot_cells(result, "size", ax=ax, key=False)
-            ax.set(xticks=[], yticks=[], ylabel="", xlabel=f"{len(result.points):,} cells")
-        west, south, east, north = place.view or (*result.diagram.domain.lower, *result.diagram.domain.upper)
-        ax.set(xlim=(west, east), ylim=(south, north), xlabel=f"{east - west:.0f} km")
-        figure.savefig(path, dpi=115)
-
-
 COLUMNS = {
     "coast": lambda r: r["coast"],
     "run": lambda r: r["run"],
@@ -225,8 +210,11 @@ def main() -> None:
                 if options.keep is not None:
                     result.save(options.keep / f"{label}.npz")
                 if options.pictures is not None:
-                    options.pictures.mkdir(parents=True, exist_ok=True)
-                    draw(result, place, options.pictures / f"{label}.png")
+                    west, south, east, north = place.view or (*domain.lower, *domain.upper)
+                    whole = {"xlabel": f"{len(result.points):,} cells"}
+                    part = {"xlim": (west, east), "ylim": (south, north), "xlabel": f"{east - west:.0f} km"}
+                    file = options.pictures / f"{label}.png"
+                    draw_sizes([(result, whole), (result, part)], file, (7.2, 4.2), [1, 1.5])
                 more = {
                     "edges": len(domain.vertices),
                     "seconds": seconds,

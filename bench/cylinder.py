@@ -454,25 +454,17 @@ def pressure_difference(case: Case, mesh: Mesh) -> dict[str, float]:
     return {"pressure": front - rear}
 
 
-class Shedding:
-    """Flows at Re 100, each of which starts from the one before."""
-
-    def __init__(self) -> None:
-        self.before: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
-
-    def flow(self, case: Case, mesh: Mesh, convection: str) -> dict[str, float]:
-        """Solve until the flow is periodic; return largest drag and lift, and the Strouhal number."""
-        start, end = None, 6.0
-        if self.before is not None:
-            points, u, p = self.before
-            near = np.array([np.argmin(((points - c) ** 2).sum(axis=1)) for c in mesh.centroids[:, :2]])
-            start, end = (u[near], p[near]), 2.5
-        step = 0.0015 * math.sqrt(3000 / len(mesh))
-        write_case(case, mesh, 100, convection, start, (end, step))
-        case.run("pimpleFoam")
-        u, p = case.field("U", len(mesh))[:, :2], case.field("p", len(mesh))[:, 0]
-        self.before = mesh.centroids[:, :2], u, p
-        return shedding_of(case, end)
+def shedding_flow(case: Case, mesh: Mesh, convection: str, before: list[np.ndarray]) -> dict[str, float]:
+    """Solve from the flow `before` until it is periodic; return largest drag and lift, and the Strouhal number."""
+    start, end = None, 6.0
+    if before:
+        points, u, p = before
+        near = np.array([np.argmin(((points - c) ** 2).sum(axis=1)) for c in mesh.centroids[:, :2]])
+        start, end = (u[near], p[near]), 2.5
+    write_case(case, mesh, 100, convection, start, (end, 0.0015 * math.sqrt(3000 / len(mesh))))
+    case.run("pimpleFoam")
+    before[:] = mesh.centroids[:, :2], case.field("U", len(mesh))[:, :2], case.field("p", len(mesh))[:, 0]
+    return shedding_of(case, end)
 
 
 def shedding_of(case: Case, end: float) -> dict[str, float]:
@@ -586,7 +578,7 @@ def main() -> None:
         "s": lambda r: f"{np.median(r['seconds']):.1f}",
     }
     report = Report(options.json, shown)
-    shedding = Shedding()
+    before: list[np.ndarray] = []
     for n in options.cells or ([3000, 6000, 13000] if re_ == 20 else [3000, 6000]):
         for mesher in (part.strip() for part in options.meshers.split(";")):
             record: dict[str, Any] = {"mesher": mesher, "reynolds": re_, "convection": convection}
@@ -606,7 +598,7 @@ def main() -> None:
                         flow = follow_vortices(case, adapter, mesh, n, convection)
                         mesh = case.latest_mesh()
                     elif re_ != 20:
-                        flow = shedding.flow(case, mesh, convection)
+                        flow = shedding_flow(case, mesh, convection, before)
                     elif mesher in FOLLOWED:
                         write_case(case, mesh, 20, convection)
                         flow = follow(case, adapter, n, options.cycles, mesher)

@@ -55,14 +55,6 @@ RATIO_3D = 1e3
 JITTER = 0.1
 
 
-def uniform(n: int, rng: np.random.Generator) -> np.ndarray:
-    return rng.random((n, 2))
-
-
-def cubed(n: int, rng: np.random.Generator) -> np.ndarray:
-    return rng.random((n, 2)) ** 3
-
-
 def radial(n: int, rng: np.random.Generator) -> np.ndarray:
     """Points of density 1 / r^2 between r = R / 10 000 and the corners, R = sqrt(1/2)."""
     kept: list[np.ndarray] = []
@@ -82,10 +74,6 @@ def hexagonal(n: int, rng: np.random.Generator) -> np.ndarray:
     p = np.column_stack([((x + 0.5 * (y % 2) + 0.25) / columns).ravel(), ((y + 0.5) / rows).ravel()])
     p += JITTER * a * (rng.random(p.shape) - 0.5) * 2
     return rng.permutation(np.clip(p, 0, 1))
-
-
-def uniform_3d(n: int, rng: np.random.Generator) -> np.ndarray:
-    return rng.random((n, 3))
 
 
 def radial_3d(n: int, rng: np.random.Generator) -> np.ndarray:
@@ -119,8 +107,15 @@ def bcc_3d(n: int, rng: np.random.Generator) -> np.ndarray:
     return rng.permutation(np.clip(p, 0, 1))
 
 
-SETS = {f.__name__: f for f in (uniform, cubed, radial, hexagonal)}
-SETS_3D = {f.__name__[:-3]: f for f in (uniform_3d, radial_3d, core_3d, bcc_3d)}
+PointSet = Callable[[int, np.random.Generator], np.ndarray]
+SETS: dict[str, PointSet] = {
+    "uniform": lambda n, rng: rng.random((n, 2)),
+    "cubed": lambda n, rng: rng.random((n, 2)) ** 3,
+    "radial": radial,
+    "hexagonal": hexagonal,
+}
+SETS_3D: dict[str, PointSet] = {"uniform": lambda n, rng: rng.random((n, 3))}
+SETS_3D |= {f.__name__[:-3]: f for f in (radial_3d, core_3d, bcc_3d)}
 
 
 KERNELS = {

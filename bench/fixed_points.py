@@ -123,18 +123,9 @@ def add(report: Report, case: str, meshes: list[clvoro.Result], *parts: str) -> 
             off = np.linalg.norm(d.centroids - d.points, axis=1) / mesh.target_size
             found.append(np.column_stack([np.abs(mesh.size_error), mesh.quality, off])[of])
         e, q, off = np.concatenate(found).T
-        record = {
-            "case": case,
-            "part": part,
-            "cells": len(meshes[0]),
-            "mean_error": e.mean(),
-            "max_error": e.max(),
-            "mean_quality": q.mean(),
-            "min_quality": q.min(),
-            "mean_off": off.mean(),
-            "max_off": off.max(),
-        }
-        report.add(record, f"{case}: {part}")
+        record = {"case": case, "part": part, "cells": len(meshes[0]), "min_quality": q.min()}
+        record |= {f"mean_{name}": x.mean() for name, x in (("error", e), ("quality", q), ("off", off))}
+        report.add({**record, "max_error": e.max(), "max_off": off.max()}, f"{case}: {part}")
 
 
 if __name__ == "__main__":

@@ -125,19 +125,11 @@ def field_of(name: str) -> clvoro.sizing.Field:
     return test_field("F1" if name == "paper" else name)
 
 
-def quality_of(diagram: clvoro.Diagram) -> np.ndarray:
-    """Return the quality of each cell, (n,): the paper's (4.1) in 2D, 36 pi V^2 / S^3 in 3D."""
-    if diagram.points.shape[1] == 2:
-        return cell_quality(diagram)
-    surface = np.add.reduceat(diagram.face_measures, diagram.neighbor_starts[:-1])
-    return 36 * math.pi * diagram.volumes**2 / surface**3
-
-
 def judge(diagram: clvoro.Diagram, h: np.ndarray) -> dict[str, float]:
     """Return the figures of the cells off the walls, after one common factor on the sizes h (n,)."""
     d = diagram.points.shape[1]
     common = float(np.exp(np.log(diagram.volumes ** (1 / d) / h)[off_walls(diagram)].mean()))
-    found = figures(diagram, h * common, quality_of(diagram))
+    found = figures(diagram, h * common, cell_quality(diagram))
     return {
         "cells": len(diagram),
         "mean_error": found["mean_error_inner"],
@@ -298,7 +290,7 @@ def draw(records: list[dict[str, Any]], meshes: dict[str, Any], path: Path) -> N
         for k, name in enumerate(DRAWN):
             ax = figure.add_subplot(grid[2 + k // 3, 4 * (k % 3) : 4 * (k % 3) + 4])
             ax.set_axis_off()
-            quality = quality_of(getattr(meshes[name], "diagram", meshes[name]))
+            quality = cell_quality(getattr(meshes[name], "diagram", meshes[name]))
             plot_cells(meshes[name], quality, ax, limits=(0.6, 1), window=WINDOW, key=False)
             ax.set_title(name, fontsize=8)
         drawn = io.BytesIO()

@@ -50,10 +50,6 @@ Made = tuple[Callable[[], Any], Callable[[Any], Array]]
 """A call that makes the diagram, and what finds the volumes (n,) in that."""
 
 
-def uniform(n: int, dim: int, rng: np.random.Generator) -> Array:
-    return rng.random((n, dim))
-
-
 def cubed(n: int, dim: int, rng: np.random.Generator) -> Array:
     """Points at r = u^3 / 2 around the center, in all directions."""
     v = rng.standard_normal((n, dim))
@@ -65,7 +61,7 @@ def clusters(n: int, dim: int, rng: np.random.Generator) -> Array:
     return (centers[rng.integers(100, size=n)] + 0.01 * rng.standard_normal((n, dim))) % 1.0
 
 
-SETS = {f.__name__: f for f in (uniform, cubed, clusters)}
+SETS = {"uniform": lambda n, dim, rng: rng.random((n, dim)), "cubed": cubed, "clusters": clusters}
 
 
 def points_of(name: str, n: int, dim: int) -> Array:

@@ -48,7 +48,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from _common import Report, counts, heading, make_adapter, names, parser
+from _common import Report, cell_quality, counts, heading, make_adapter, names, parser
 from _openfoam import require
 from _solid_shapes import LAYERED, SHAPES, random_part, solid_of
 from _surface_scenes import SCENES
@@ -102,12 +102,6 @@ def worst_of(records: list[dict[str, Any]]) -> list[dict[str, Any]]:
     ]
 
 
-def quotient(diagram: clvoro.Diagram) -> float:
-    """Return the mean over the cells of 36 pi V^2 / A^3."""
-    area = np.add.reduceat(diagram.face_measures, diagram.neighbor_starts[:-1])
-    return float((36 * np.pi * diagram.volumes**2 / area**3).mean())
-
-
 def measure(adapter: clvoro.Adapter, make: Callable[[], Made], case: Path) -> dict[str, Any]:
     """Adapt, write and check a mesh; return its figures."""
     begin = time.process_time()
@@ -124,7 +118,7 @@ def measure(adapter: clvoro.Adapter, make: Callable[[], Made], case: Path) -> di
         "cells": len(d),
         "seconds": seconds,
         "error": float(np.abs(result.size_error).mean()),
-        "quotient": quotient(d),
+        "quotient": float(cell_quality(d).mean()),
         "volume": float(d.volumes.sum() / solid.measure),
         **figures_of(verdict),
         **more(result, case),

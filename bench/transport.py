@@ -16,7 +16,6 @@ Voronoi cells and power cells of equal area of the same generators.
 
 from __future__ import annotations
 
-import argparse
 from pathlib import Path
 
 import numpy as np
@@ -59,17 +58,6 @@ COLUMNS = {
 }
 
 
-def make_options() -> argparse.ArgumentParser:
-    made = parser(__doc__)
-    made.add_argument("--sizes", type=counts, default=counts("1e3,1e4"), metavar="N,...")
-    made.add_argument("--domains", type=names, default=list(DOMAINS), metavar="NAMES")
-    made.add_argument("--repeat", type=int, default=3, metavar="N")
-    made.add_argument("--picture", action="store_true", help="draw a picture instead")
-    made.add_argument("--out", type=Path, default=PICTURES, metavar="DIR")
-    made.add_argument("--processor-time", action="store_true", help="not the wall clock")
-    return made
-
-
 def draw(adapter: clvoro.Adapter, folder: Path) -> None:
     """Draw the Voronoi cells of random generators beside their power cells of equal area."""
     import matplotlib.pyplot as plt
@@ -90,7 +78,14 @@ def draw(adapter: clvoro.Adapter, folder: Path) -> None:
 
 
 def main(arguments: list[str] | None = None) -> None:
-    options = make_options().parse_args(arguments)
+    made = parser(__doc__)
+    made.add_argument("--sizes", type=counts, default=counts("1e3,1e4"), metavar="N,...")
+    made.add_argument("--domains", type=names, default=list(DOMAINS), metavar="NAMES")
+    made.add_argument("--repeat", type=int, default=3, metavar="N")
+    made.add_argument("--picture", action="store_true", help="draw a picture instead")
+    made.add_argument("--out", type=Path, default=PICTURES, metavar="DIR")
+    made.add_argument("--processor-time", action="store_true", help="not the wall clock")
+    options = made.parse_args(arguments)
     adapter = make_adapter(options)
     if options.picture:
         draw(adapter, options.out)
