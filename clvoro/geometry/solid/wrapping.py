@@ -103,11 +103,13 @@ def wrapped(
     place[[names.index(k) for k in kept]] = 1 + np.arange(len(kept))
     made, group = _with_groups(grid.level(name, sign * ((1 - _OFF) * reach - depth)), near, place[groups], reach)
     names = ("rest" if rest in kept else rest, *kept)
-    for share in _SIMPLER:
+    share, *less = _SIMPLER
+    while True:
         result = boolean("+", (made.vertices, made.triangles, group, list(names)), simpler=share * step)
         closed = Surface(result["vertices"] + middle, result["triangles"], name)
-        if not (len(repeated_triangles(closed.welded[1])) or len(closed.crossings())):
+        if not less or not (len(repeated_triangles(closed.welded[1])) or len(closed.crossings())):
             break
+        share = less.pop(0)
     lost = [names[g] for g in range(1, len(names)) if not (result["groups"] == g).any()]
     if lost:
         raise InputError(
