@@ -115,6 +115,8 @@ class InsertionDeletion:
         need = math.trunc(change.missing + math.copysign(0.3, change.missing))
         most = max(4, int(tuning.MAX_CHANGE * n))
         need = max(-most, min(most, need))
+        is_far = abs(change.missing) > tuning.FAR_COUNT * n
+        rings = tuning.FAR_RINGS[self.engine.cell_dim] if is_far else tuning.LOG_RATIO_RINGS
         marks = _Marks.clean(self._room, t, self.engine.dim)
         if change.climb:
             kinds, strain_1, strain_2 = self._measure(t, sizes.h)
@@ -126,9 +128,9 @@ class InsertionDeletion:
             self._room.clear("kinds", "strain", "partners", "pull", "merged")
             rest = need - gained
             if abs(rest) > max(2, abs(need) // 10) or (need and not gained):
-                self._split_or_delete(present, sizes.log_ratio, marks, rest)
+                self._split_or_delete(present, sizes.log_ratio, marks, rest, rings)
         elif need:
-            self._split_or_delete(present, sizes.log_ratio, marks, need)
+            self._split_or_delete(present, sizes.log_ratio, marks, need, rings)
         self._room.clear("keys", "spread", "chosen", "latest", "ranks")
         return self._apply(present, marks)
 
@@ -260,14 +262,17 @@ class InsertionDeletion:
         engine.run_each(k.mark_pairs, n, *t.graph, *pairs, *names, *moved, *engine.period_args)
         return int(changes[best])
 
-    def _split_or_delete(self, present: Present, log_ratio: cla.Array, marks: _Marks, rest: int) -> None:
-        """Mark about `rest` of the largest cells to split, or -rest of the smallest to delete, relative to h."""
+    def _split_or_delete(self, present: Present, log_ratio: cla.Array, marks: _Marks, rest: int, rings: int) -> None:
+        """Mark about `rest` of the largest cells to split, or -rest of the smallest to delete, relative to h.
+
+        They are `rings` rings of cells apart.
+        """
         engine, k, t, n = self.engine, self._kernels, present.t, present.t.n
         sign, keys = engine.real.type(math.copysign(1, rest)), self._keys(t)
         engine.run_each(k.score_log_ratio, n, *t.graph, log_ratio, sign, *t.name_args, keys)
         self._drop_fixed(present, keys, neighbors=False)
-        engine.run_each(k.drop_sites, n, self.spread(t, marks.busy, tuning.LOG_RATIO_RINGS), keys)
-        chosen = self._choose(t, keys, tuning.LOG_RATIO_RINGS)
+        engine.run_each(k.drop_sites, n, self.spread(t, marks.busy, rings), keys)
+        chosen = self._choose(t, keys, rings)
         self._limit(t, chosen, rest if rest > 0 else min(-rest, self._count(t) - 1))
         self._mark_split_delete(t, chosen, 0 if rest > 0 else NEVER, marks)
 

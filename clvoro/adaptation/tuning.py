@@ -75,6 +75,9 @@ NUCLEATION_STRAIN = 0.22
 """Anisotropy of the lattice above which a pair of dislocations may be nucleated."""
 PAIR_RINGS, NUCLEUS_RINGS, LOG_RATIO_RINGS = 4, 6, 3
 """Rings of cells between sites that change in the same call, so that their displacements do not interact."""
+FAR_COUNT, FAR_RINGS = 0.1, {2: 3, 3: 1}
+"""If more than this share of the generators is missing or too much, nearly all cells of some parts change, and sites in
+3D, where three rings are some 200 cells, may be next to each other."""
 ROUNDS = 3
 """Rounds of choosing sites. Each takes the strongest of the remaining sites."""
 SHIFTS, SHIFT_STEP = 51, 0.01
