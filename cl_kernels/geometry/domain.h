@@ -20,7 +20,7 @@
 #define DOMAIN_ARGS const REAL4 box_lower, const REAL4 box_upper, WALL_ARGS
 #define DOMAIN box_lower, box_upper, WALL
 #define keep_inside keep_inside_by_path
-#define reflect_inside keep_inside_by_path
+#define reflect_inside stay_off_walls
 #define exit_parameter exit_from_solid
 #elif defined(SPHERE)
 #define DOMAIN_ARGS const REAL4 box_lower, const REAL4 box_upper
@@ -143,6 +143,18 @@ inline void keep_inside_by_path(const REAL *x, REAL *y, DOMAIN_ARGS)
     if (t <= 1)
         EACH_AXIS (a)
             y[a] = x[a] + t / 2 * (y[a] - x[a]);
+}
+#endif
+
+#ifdef SOLID
+/* As keep_inside_by_path, but a generator much nearer to the wall than the way is long stays: in each step in which it
+   is pushed out, it would halve its distance, down to round-off. */
+inline void stay_off_walls(const REAL *x, REAL *y, DOMAIN_ARGS)
+{
+    const REAL t = exit_parameter(x, y, DOMAIN);
+    if (t <= 1)
+        EACH_AXIS (a)
+            y[a] = t < R(0.0625) ? x[a] : x[a] + t / 2 * (y[a] - x[a]);
 }
 #endif
 

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from clvoro.adaptation.motion import Motion
+from clvoro.adaptation.motion import Displacement, Motion
+from clvoro.geometry.solid.solid import Solid
 from clvoro.opencl.primitives import Summaries
 from tests.reference import patch
 
@@ -47,3 +48,19 @@ def test_add_momentum(engine):
     Motion(engine).add_momentum(1.3, on_device, engine.upload(velocity), 0.7)
     expected = 1.3 * lloyd + 0.7 * velocity
     assert on_device.get() == pytest.approx(expected, abs=16 * float(np.finfo(engine.real).eps))
+
+
+@pytest.mark.parametrize("real", ["float64", "float32"])
+def test_generators_near_a_wall_of_a_solid_stay(ctx, real):
+    """A step over a wall ends half-way to it. Near the wall there is none: distances would fall to round-off."""
+    solid = Solid.box((0, 0, 0), (1, 1, 1))
+    engine = patch.make_engine(ctx, real, 3, box=solid)
+    depths = np.array([0.01, 0.1, 0.4])
+    origin, scale = solid.frame
+    x = np.column_stack([1 - depths, np.full((3, 2), 0.5)])
+    points, way = engine.upload((x - origin) / scale), engine.upload(np.array([[0.3, 0, 0]] * 3) / scale)
+    none, velocity = engine.zeros((3, 3)), engine.zeros((3, 3))
+    step = Displacement(way, none, engine.upload(np.ones(3)))
+    Motion(engine).move_generators(solid, points, step, velocity)
+    moved = (origin + scale * points.get() - x)[:, 0]
+    assert moved == pytest.approx([0, 0.05, 0.3], abs=1e-5 if real == "float32" else 1e-12)
