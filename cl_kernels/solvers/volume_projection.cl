@@ -170,8 +170,9 @@ inline void assemble_rows(ITERATION_ARGS, ASSEMBLY_ARGS PERIOD_ARGS, group_t gro
                 least_quality = fmin(least_quality, least_float(CONVERT(float, PICK(REAL, quality, j, 1, 0))));
         }
 #ifdef SOLID
-        /* Walls cut each cell by itself, so that the face of the cell across may differ. Columns are of that face: else
-           they were not the transpose of the rows, and the iteration could diverge. */
+        /* Walls cut each cell by itself, so that the face of the cell across may differ. Derivatives are the means of
+           those by both faces: else B^T were not the transpose of B, and the iteration could diverge. */
+        diagonal = 0;
         for (int k = starts[i]; k < end; ++k) {
             const int j = neighbors[k], back = j < 0 ? -1 : find_entry(i, j, faces - 8, starts, neighbors);
             if (back < 0)
@@ -181,9 +182,17 @@ inline void assemble_rows(ITERATION_ARGS, ASSEMBLY_ARGS PERIOD_ARGS, group_t gro
                 away[a] = x[a] - points[3 * j + a];
                 square += away[a] * away[a];
             }
-            const REAL there = is_fixed ? 0 : face_measures[back] / sqrt(square) * hi / volumes[j];
-            EACH_AXIS (a)
-                columns[a * room + k] = there * (away[a] - face_centroids[3 * back + a]);
+            const REAL w = R(0.5) * face_measures[back] / sqrt(square);
+            const REAL here = fixed > 0 && labels[j] < fixed ? 0 : w * h[j] / volumes[i];
+            const REAL there = is_fixed ? 0 : w * hi / volumes[j];
+            EACH_AXIS (a) {
+                const int at = a * room + k;
+                const REAL m = face_centroids[3 * back + a], more = -here * m - R(0.5) * rows[at];
+                rows[at] += more;
+                columns[at] = R(0.5) * columns[at] + there * (away[a] - m);
+                change += more * displacement[3 * j + a] / h[j];
+                diagonal += rows[at] * rows[at];
+            }
         }
 #endif
         float slope[DIM], moved[DIM];

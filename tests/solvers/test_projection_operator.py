@@ -62,10 +62,12 @@ class Given:
         ways = patch.ways(host, self.box)
         for k in np.flatnonzero(host.neighbors >= 0):
             i, j, d = host.owners[k], host.neighbors[k], ways[k]
-            w = host.face_measures[k] / np.linalg.norm(d) / host.volumes[i]
-            J[i, j] += w * (d - host.face_centroids[k])
-            J[i, i] += w * host.face_centroids[k]
+            w, m = host.face_measures[k] / np.linalg.norm(d), host.face_centroids[k]
+            J[i, i] += w / host.volumes[i] * m
             worst[i] = min(worst[i], self.quality[j])
+            # In a solid both cells have a face of their own: the mean of the derivatives by both.
+            J[i, j] += w / host.volumes[i] * (d - m) / 2
+            J[j, i] -= w / host.volumes[j] * m / 2
         J[np.arange(self.n), np.arange(self.n)] -= self.box.cell_dim * self.gradient
         if self.box.cell_dim < dim:  # on a sphere generators move in their tangent planes
             normal = host.points
