@@ -1024,6 +1024,7 @@ ROWS = [
 
 
 TESTED_IN = {
+    "file, expected GeoJSON": "adaptation/test_messages.py::test_shapefiles",
     "is a geometry, expected a case": "cli/test_cli.py::test_errors_are_one_message",
     "which is too small for its extent": "geometry/solid/test_files_and_booleans.py::test_wrong_options_are_refused",
     "longer than the surface": "geometry/solid/test_files_and_booleans.py::test_wrong_options_are_refused",
