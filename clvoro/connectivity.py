@@ -1,4 +1,7 @@
-"""Connectivity as arrays: ragged rows, as `starts` and `items`, sets of indices, and components of graphs."""
+"""Connectivity in arrays: ragged rows, sets of indices, and components of graphs.
+
+Row i of a ragged array of n rows is ``items[starts[i] : starts[i + 1]]``; `starts` has n + 1 numbers.
+"""
 
 from __future__ import annotations
 
@@ -9,25 +12,25 @@ import scipy
 
 
 def starts_of(counts: np.ndarray | list[int], dtype: type = np.int64) -> np.ndarray:
-    """Return where rows of `counts` (n,) items begin, and the end of the last, (n + 1,)."""
+    """Return the `starts` (n + 1,) of rows with `counts` (n,) items."""
     found = np.zeros(len(counts) + 1, dtype)
     np.cumsum(counts, out=found[1:])
     return found
 
 
 def rows_of(starts: np.ndarray) -> np.ndarray:
-    """Return the row of each item."""
+    """Return the number of the row that each item is in, (k,) int."""
     return np.repeat(np.arange(len(starts) - 1), np.diff(starts))
 
 
 def rows_and_places(counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return for each item of rows of `counts` (n,) items its row, and its place in the row."""
+    """Return the row that each item is in, and its place there, (k,) int each; rows have `counts` (n,) items."""
     row = np.repeat(np.arange(len(counts)), counts)
     return row, np.arange(len(row)) - np.repeat(np.cumsum(counts) - counts, counts)
 
 
 def ranges(first: np.ndarray, last: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return all pairs (i, k) with first[i] <= k <= last[i]."""
+    """Return i and k, (m,) int each, of all pairs with ``first[i] <= k <= last[i]``, by i, then k."""
     i, place = rows_and_places(last - first + 1)
     return i, place + first[i]
 
@@ -76,8 +79,7 @@ def take_ranges(
     begin: np.ndarray, counts: np.ndarray, items: np.ndarray, backwards: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return rows of `items`: row i has ``counts[i]`` of them, from ``begin[i]`` on; see `take_rows`."""
-    taken = np.zeros(len(counts) + 1, np.int64)
-    np.cumsum(counts, out=taken[1:])
+    taken = starts_of(counts)
     found = np.empty((taken[-1], *items.shape[1:]), items.dtype)
     for part in slices(len(counts)):
         first, end = int(taken[part.start]), int(taken[part.stop])
@@ -135,12 +137,15 @@ def independent(sets: np.ndarray, cells: np.ndarray, priority: np.ndarray, n: in
 
 
 def components(n: int, i: np.ndarray, j: np.ndarray) -> tuple[int, np.ndarray]:
-    """Return the number of connected components of a graph of `n` nodes with edges `i` to `j`, and each node's."""
+    """Return the number of connected components of a graph, and the component of each of its `n` nodes, (n,) int.
+
+    Edge k leads from node ``i[k]`` to node ``j[k]``.
+    """
     graph = scipy.sparse.coo_array((np.ones(len(i), bool), (i, j)), shape=(n, n))
     return scipy.sparse.csgraph.connected_components(graph, directed=False)
 
 
 def first_nodes(n: int, i: np.ndarray, j: np.ndarray) -> np.ndarray:
-    """Return for each node of a graph of `n` nodes with edges `i` to `j` the first one of its component, (n,) int."""
+    """Return the first node of the component that each node is in, (n,) int; see `components`."""
     label = components(n, i, j)[1]
     return np.unique(label, return_index=True)[1][label]

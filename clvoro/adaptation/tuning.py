@@ -76,8 +76,8 @@ NUCLEATION_STRAIN = 0.22
 PAIR_RINGS, NUCLEUS_RINGS, LOG_RATIO_RINGS = 4, 6, 3
 """Rings of cells between sites that change in the same call, so that their displacements do not interact."""
 FAR_COUNT, FAR_RINGS = 0.1, {2: 3, 3: 1}
-"""If more than this share of the generators is missing or too much, nearly all cells of some parts change, and sites in
-3D, where three rings are some 200 cells, may be next to each other."""
+"""If more than this share of the generators is missing or superfluous, so many rings are between sites, by dimension.
+In 3D three rings are some 200 cells, and in some regions nearly all cells change."""
 ROUNDS = 3
 """Rounds of choosing sites. Each takes the strongest of the remaining sites."""
 SHIFTS, SHIFT_STEP = 51, 0.01

@@ -159,7 +159,7 @@ def word(name: str, number: int) -> str:
 
 
 def _read_step(path: Path) -> list[FilePart]:
-    """Return the surface of the solids in a STEP file, united, in meters; faces of one name are a part."""
+    """Return the surface of the union of the solids in a STEP file, in meters. Faces of one name are a part of it."""
     try:
         import gmsh
     except (ImportError, OSError) as error:

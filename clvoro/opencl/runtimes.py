@@ -97,7 +97,7 @@ def cache_remedy() -> str:
 
 
 def full_cache_remedy() -> str:
-    """Return advice if nothing can be written to the user's cache folder, else nothing."""
+    """Return what to do if the user's cache folder cannot be written to; "" if it can."""
     with contextlib.suppress(RuntimeError):  # the user has no home
         if not _has_room(cache_home()):
             return f"nothing can be written to {cache_home()}. {cache_remedy()}. "

@@ -21,7 +21,7 @@ SPLIT_COUNT = {2: 10, 3: 18}
 SPACING_COUNT = 8
 """Least number of generators from which the spacing around a leaf is estimated."""
 BOUNDS = 256
-"""Number of shares of the generators of a part whose extents are found."""
+"""Number of shares of the points of a part. The device finds the box around each share, the host the one around all."""
 _ZERO = np.zeros(1, np.int32)
 _WORK = ("_keys", "_counts", "_grid_of", "_grid_items", "_starts", "_flags", "_sizes")
 """Buffers that only `build` uses."""

@@ -165,7 +165,7 @@ class Part:
         given = (*t.graph, self.labels, t.sites, *self.box.clip_args(engine), *t.vertices)
         reach = engine.scratch(t.n, np.float32) if t.reach is None else t.reach
         measures = t.face_measures, t.face_centroids, t.volumes, t.offsets, t.covariances, reach
-        lanes = LANES if engine.cell_dim == 2 and has_lanes(engine) else 1
+        lanes = 1 if t.vertices or not has_lanes(engine) else LANES
         defines = {**defines, "BY_PLACE": 1, "IN_LANES": int(lanes > 1)}
         order = engine.kernels("tessellation/row_order", defines, shared=True).order_rows
         args = *given, *measures, *(engine.period_args if t.vertices else ())

@@ -68,7 +68,7 @@ Gain = tuple[int, float, float]
 Option = tuple[Gain, Edits, list[int]]
 """What a cure gains, its changes, and which of the cells that they touch are rejected after it."""
 _Facing = tuple[tuple[int, ...], np.ndarray, np.ndarray, np.ndarray, float]
-"""What is asked of a face to another cell; see `Cures._facing`."""
+"""Measures of a face to another cell; see `Cures._facing`."""
 
 
 class Cures:
@@ -386,7 +386,7 @@ class Cures:
                 yield trial
 
     def slides(self, edits: Edits, cell: int) -> Iterator[Edits]:
-        """Move one corner of an oblique or skewed face along an edge of the cell, or beyond its own end of the edge."""
+        """Move one corner of an oblique or skewed face along the line of an edge of the cell, to either side."""
         bad = set[int]()
         for loop, _, normal, line, skewness in self._facing(edits, cell):
             if normal @ line < math.cos(math.radians(WANTED_ANGLE)) or skewness > _SKEWED:
@@ -405,7 +405,7 @@ class Cures:
             yield trial
 
     def _facing(self, edits: Edits, cell: int) -> Iterator[_Facing]:
-        """Return what is asked of each face to another cell: (corners, places, normal, line, skewness).
+        """Return the measures of each face to another cell: (corners, places, normal, line, skewness).
 
         `line` is the direction of the line through both centroids. The skewness is about that of OpenFOAM: how far the
         line passes from the mean of the corners, over the largest distance of a corner from it.
@@ -588,7 +588,8 @@ def cured(
     cures = Cures(surface, faces, names, sizes, earlier, oblique is not None)
     if oblique is not None:
         cures.most = cures.searches + _OBLIQUE + len(begun)
-    for cures.branches in (_BRANCHES,) if oblique is None else (_BRANCHES, _MORE_BRANCHES):
+    for branches in (_BRANCHES,) if oblique is None else (_BRANCHES, _MORE_BRANCHES):
+        cures.branches = branches
         cures.work_on(begun)
     made, cells, left = cures.result(rejected)
     if len(left) > len(rejected):

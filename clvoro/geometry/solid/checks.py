@@ -52,7 +52,7 @@ def repeated_triangles(triangles: np.ndarray) -> np.ndarray:
 
 
 def _closed_by(surface: Surface, parts: Sequence[str]) -> str:
-    """Return what closes an open surface, as a sentence: a distance, a repair, or what works for any sheet.
+    """Return how an open surface can be closed, as a sentence: by `join`, by a repair, or by other options.
 
     - `parts` (t,) str: the part of each triangle.
     """

@@ -152,9 +152,10 @@ class Solid(Domain):
         known += [f"group-{g}" for g in range(len(known), int(group.max()) + 1)]
         self._group_names = tuple(known)
         if bottom is not None:
+            repair = True
             given, group, self._group_names = grounded(given, group, self._group_names, bottom)
             known = list(self._group_names)
-        if repair or bottom is not None:
+        if repair:
             given, group, self.repairs, holes = repaired(given, group, len(known))
             self._group_names += tuple(f"hole-{k + 1}" for k in range(holes))
         if wrap is None and inside is not None:
@@ -174,7 +175,7 @@ class Solid(Domain):
         self._group, merged = group[whole], merged[whole]
         self.surface = Surface(places, merged, name)
         parts = [self._group_names[g] for g in group.tolist()]
-        self.twin = require_bounding(given, places, merged, parts, repair or bottom is not None)
+        self.twin = require_bounding(given, places, merged, parts, repair)
         angle = 30 if angle is None else angle
         if not (isinstance(angle, Real) and 0 < angle < 180):
             raise InputError(f"{name} angle is {angle!r}, expected degrees between 0 and 180")
@@ -573,7 +574,7 @@ class Solid(Domain):
         return np.divide(along, length2, out=np.zeros_like(along), where=length2 > 0).max(axis=1)
 
     def crease_edges(self, walls: Walls | None = None, *, concave: bool | None = None) -> Edges:
-        """Return creases as a shape for `clvoro.sizing.Distance`.
+        """Return the edges of creases, from which `clvoro.sizing.Distance` measures distances.
 
         Parameters
         ----------

@@ -35,7 +35,8 @@ _SHEAR = np.array([(1, 0, 0), (0.17, 1, 0), (0.11, 0, 1)])
 _UNSHEARED = np.linalg.inv(_SHEAR)
 """The library sees positions times this matrix: its level sets crash, at times, at large planes x = constant."""
 _SIMPLER = (0.1, 0.05, 0)
-"""How far triangles may move to be fewer, in steps of the grid: the first one whose surface does not cross itself."""
+"""How far triangles may move so that fewer are left, in steps of the grid. The first distance is taken after which the
+surface does not cross itself."""
 _SPACING, _APART = 1.0, 0.25
 """Distances are those to the triangle of the nearest sample. Longest edge of the parts of triangles that have a sample,
 and edge of the cubes that keep one of their samples, in steps of the grid."""
@@ -103,13 +104,11 @@ def wrapped(
     place[[names.index(k) for k in kept]] = 1 + np.arange(len(kept))
     made, group = _with_groups(grid.level(name, sign * ((1 - _OFF) * reach - depth)), near, place[groups], reach)
     names = ("rest" if rest in kept else rest, *kept)
-    share, *less = _SIMPLER
-    while True:
+    for share in _SIMPLER:
         result = boolean("+", (made.vertices, made.triangles, group, list(names)), simpler=share * step)
         closed = Surface(result["vertices"] + middle, result["triangles"], name)
-        if not less or not (len(repeated_triangles(closed.welded[1])) or len(closed.crossings())):
+        if not (len(repeated_triangles(closed.welded[1])) or len(closed.crossings())):
             break
-        share = less.pop(0)
     lost = [names[g] for g in range(1, len(names)) if not (result["groups"] == g).any()]
     if lost:
         raise InputError(
