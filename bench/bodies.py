@@ -77,7 +77,7 @@ def around_airfoil() -> clvoro.Polygon:
 
 def around_sphere() -> clvoro.Solid:
     """Return a box around a sphere of diameter 1."""
-    ball = clvoro.Solid.ball((0, 0, 0), 0.5, edge=0.03, group_names=["body"])
+    ball = clvoro.Solid.ball((0, 0, 0), 0.5, edge=0.03, name="body")
     sides = {"inlet": 0, "outlet": 1, "sides": [2, 3, 4, 5]}
     return clvoro.Solid.outside(ball, clvoro.Box((-6, -6, -6), (10, 6, 6), names=sides))
 

@@ -67,7 +67,7 @@ TUTORIALS = Path("/usr/share/doc/openfoam-examples/examples/resources/geometry")
 
 def around_sphere() -> clvoro.Solid:
     """Return a box around a sphere; patches are far and body."""
-    ball = clvoro.Solid.ball((0, 0, 0), RADIUS, edge=0.05 * RADIUS, group_names=["body"])
+    ball = clvoro.Solid.ball((0, 0, 0), RADIUS, edge=0.05 * RADIUS, name="body")
     box = clvoro.Box((-SIDE,) * 3, (SIDE,) * 3, names={"far": range(6)})
     return clvoro.Solid.outside(ball, box)
 

@@ -20,6 +20,15 @@ WORD = re.compile(r"[A-Za-z_][A-Za-z0-9_.-]*")
 _LISTED = 12  # names or numbers in an error message
 
 
+def check_word(what: str, name: object) -> str:
+    """Return the name of a boundary, or raise `InputError` if it is not a word."""
+    if not isinstance(name, str) or not WORD.fullmatch(name):
+        raise InputError(
+            f"{what} {name!r:.60}, expected a word of ASCII letters, digits, _, . and - that begins with a letter or _"
+        )
+    return name
+
+
 @dataclass(frozen=True)
 class BoundaryNames:
     """The parts of one boundary.
@@ -94,11 +103,7 @@ class BoundaryNames:
             )
         index = np.full(len(self.index), -1, np.int32)
         for k, (name, walls) in enumerate(names.items()):
-            if not isinstance(name, str) or not WORD.fullmatch(name):
-                raise InputError(
-                    f"{what} has the name {name!r:.60}, expected a word of ASCII letters, digits, _, . and - that "
-                    "begins with a letter or _"
-                )
+            check_word(f"{what} has the name", name)
             chosen = self.select(f"{what}[{name!r}]", walls)
             twice = chosen[index[chosen] >= 0]
             if twice.size:

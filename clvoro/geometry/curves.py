@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 
 from ..arguments import check_choice, check_integer, check_number, check_rows, format_point
 from ..errors import InputError, InputTypeError
-from .boundary_names import WORD
+from .boundary_names import check_word
 from .domain import LARGEST_EDGE
 
 
@@ -174,11 +174,8 @@ class Curve:
         self.kind, self.spans, self.closed = kind, tuple(spans), closed
         self.arguments = {key: value for key, value in arguments.items() if value is not None}
         name = self.name = arguments.get("name")
-        if name is not None and (not isinstance(name, str) or not WORD.fullmatch(name)):
-            raise InputError(
-                f"{kind} name is {name!r:.60}, expected a word of ASCII letters, digits, _, . and - that begins with a "
-                "letter or _"
-            )
+        if name is not None:
+            check_word(f"{kind} name is", name)
         points = np.concatenate([s.at(np.linspace(s.begin, s.end, s.samples + 1))[0] for s in self.spans])
         self.extent = float(np.ptp(points, axis=0).max())
         far = float(np.abs(points).max())

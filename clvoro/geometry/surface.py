@@ -7,6 +7,7 @@ from functools import cached_property
 from numbers import Real
 from os import PathLike
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import scipy
@@ -303,6 +304,17 @@ class Surface:
 
     def __repr__(self) -> str:
         return f"Surface({len(self.vertices)} vertices, {len(self.triangles)} triangles)"
+
+
+class Skin(NamedTuple):
+    """A surface that may bound a solid: its triangles are in groups that have names."""
+
+    surface: Surface
+    groups: np.ndarray
+    """Group of each triangle, (t,) int."""
+    names: tuple[str, ...]
+    done: tuple[str, ...] = ()
+    """What was done to the surface, for messages."""
 
 
 def box_surface(lower: np.ndarray, upper: np.ndarray) -> Surface:

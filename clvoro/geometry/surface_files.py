@@ -16,6 +16,7 @@ import numpy as np
 
 from ..errors import InputError, MissingLibraryError
 from ..files import open_plain, unlogged
+from .triangles import NamedTriangles
 
 FilePath = str | PathLike[str]
 SURFACES = ("stl", "obj", "ply", "off")
@@ -137,17 +138,15 @@ def unit_length(units: str | float | None) -> float:
     raise InputError(f"units is {units!r}, expected one of {', '.join(_UNITS)}, or the length of the unit in meters")
 
 
-def solid_arguments(parts: list[FilePart], unit: float) -> dict[str, Any]:
-    """Return the arguments of a solid from the parts of a file; parts of one name are one group."""
+def named_parts(parts: list[FilePart], unit: float = 1.0) -> NamedTriangles:
+    """Return the parts of a file as one surface; parts of one name are one group."""
     vertices, triangles, part = joined(parts)
-    arguments: dict[str, Any] = {"vertices": unit * vertices, "triangles": triangles}
     if len(parts) == 1:
         known = parts[0].name.strip()
-        return arguments | ({"group_names": [word(known, 0)]} if known else {})
+        return NamedTriangles(unit * vertices, triangles, names=(word(known, 0) if known else "wall",))
     words = [word(p.name, k) for k, p in enumerate(parts)]
     names = list(dict.fromkeys(words))
-    groups = np.array([names.index(w) for w in words])[part]
-    return arguments | {"groups": groups, "group_names": names}
+    return NamedTriangles(unit * vertices, triangles, np.array([names.index(w) for w in words])[part], names)
 
 
 def word(name: str, number: int) -> str:

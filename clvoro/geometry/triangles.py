@@ -2,11 +2,41 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import DTypeLike
 
 _TOUCH = 1e-9  # of the size of a pair: a smaller overlap counts as contact
 _FLAT = 1e-9  # a patch is flat if its mean normal is shorter than 1 by less than this
+
+
+class NamedTriangles(NamedTuple):
+    """Triangles in groups that have names: the first arguments of `clvoro.Solid`, in their order."""
+
+    vertices: np.ndarray
+    triangles: np.ndarray
+    groups: np.ndarray | None = None
+    """Group of each triangle, (t,) int; without it all have the first name."""
+    names: Sequence[str] = ("wall",)
+
+    @classmethod
+    def merged(cls, parts: Sequence[NamedTriangles]) -> NamedTriangles:
+        """Return several as one. Groups of one name become one."""
+        names = tuple(dict.fromkeys(name for part in parts for name in part.names))
+        starts = np.cumsum([0, *(len(part.vertices) for part in parts)])
+        return cls(
+            np.concatenate([part.vertices for part in parts]),
+            np.concatenate([part.triangles + start for part, start in zip(parts, starts[:-1], strict=True)]),
+            np.concatenate([part.numbers(names) for part in parts]),
+            names,
+        )
+
+    def numbers(self, names: Sequence[str]) -> np.ndarray:
+        """Return the place in `names` of the name of each triangle, (t,) int."""
+        mine = np.array([names.index(name) for name in self.names])
+        return mine[np.zeros(len(self.triangles), np.int64) if self.groups is None else self.groups]
 
 
 def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -12,8 +12,9 @@ import shapely
 from ...arguments import check_number, format_point
 from ...errors import InputError
 from ..columns import Columns
-from ..surface import Surface
-from .combining import boolean, library, merged
+from ..surface import Skin, Surface
+from ..triangles import NamedTriangles
+from .combining import boolean, library
 from .creases import connect, pair_sides, triangle_normals
 
 _FLAT = 1e-3  # of the extent of a hole: how far it may deviate from a plane
@@ -59,9 +60,9 @@ def _closed_by(surface: Surface, parts: Sequence[str]) -> str:
     join = closing_distance(surface)
     if join is not None:
         return f"Here join={join:g} closes it"
-    mended, _, done, _ = repaired(surface, np.zeros(len(surface), np.int64), 1)
-    if mended.closed:
-        return f"Here repair=True closes it ({'; '.join(done)})"
+    mended = repaired(Skin(surface, np.zeros(len(surface), np.int64), ("wall",)))
+    if mended.surface.closed:
+        return f"Here repair=True closes it ({'; '.join(mended.done)})"
     others = "" if len(set(parts)) > 1 else "If other files close it, read them together: Solid.read([...]). "
     return (
         f"{others}The ground below a terrain is a solid with bottom=, a height. Sheets inside of a domain are for "
@@ -92,18 +93,16 @@ def _gaps(surface: Surface, parts: Sequence[str]) -> str:
     return f" Of these {'; '.join(found)}."
 
 
-def require_bounding(
-    surface: Surface, vertices: np.ndarray, triangles: np.ndarray, parts: Sequence[str] = (), repair: bool = False
-) -> np.ndarray:
+def require_bounding(skin: Skin, vertices: np.ndarray, triangles: np.ndarray, repair: bool = False) -> np.ndarray:
     """Raise unless the triangles (t, 3) bound a region with normals outwards; return the partners of their sides.
 
-    - `surface`: as given, for messages.
+    - `skin`: as given, for messages.
     - `vertices`, `triangles`: the welded surface.
-    - `parts` (t,) str: the name of the part that each triangle of `surface` belongs to, for messages.
     - `repair`: whether the surface is repaired already, which is no remedy then.
 
     Raises `InputError` if the surface is open, has duplicate or flipped triangles, is inside out, or intersects itself.
     """
+    surface = skin.surface
     name, mend = surface.name, _OR_WRAP if repair else "Or pass repair=True"
     repeated = repeated_triangles(triangles)
     if repeated.size:
@@ -112,7 +111,9 @@ def require_bounding(
             f"{name} has {len(repeated)} duplicate triangles, the first at {where}, expected each once; remove "
             f"them. {mend}"
         )
-    surface.require_closed("" if surface.closed else f".{_gaps(surface, parts)} {_closed_by(surface, parts)}")
+    if not surface.closed:
+        parts = [skin.names[g] for g in skin.groups.tolist()]
+        surface.require_closed(f".{_gaps(surface, parts)} {_closed_by(surface, parts)}")
     twin, bad = pair_sides(vertices, triangles)
     if bad.size:
         k, s = divmod(int(bad[0]), 3)
@@ -173,13 +174,14 @@ def sharp_edges(angle: np.ndarray) -> np.ndarray:
     return np.flatnonzero(np.minimum(angle, 2 * math.pi - angle) < math.radians(_SHARPEST))
 
 
-def repaired(surface: Surface, groups: np.ndarray, n_groups: int) -> tuple[Surface, np.ndarray, tuple[str, ...], int]:
-    """Return a surface that is mended where that is certain, its groups, what was done, and the number of closed holes.
+def repaired(skin: Skin) -> Skin:
+    """Return a surface that is mended where that is certain.
 
     Vertices across small gaps are joined, triangles without three corners and duplicates are removed, flat holes are
-    closed, each by a group of its own after those given, neighbors are oriented alike, parts that cross or touch each
-    other are united, and normals point out of the region, of cavities too.
+    closed, each by a group of its own, hole-1, ..., neighbors are oriented alike, parts that cross or touch each other
+    are united, and normals point out of the region, of cavities too.
     """
+    surface, groups, names, _ = skin
     done: list[str] = []
     if not surface.closed:
         join = closing_distance(surface)
@@ -198,7 +200,8 @@ def repaired(surface: Surface, groups: np.ndarray, n_groups: int) -> tuple[Surfa
     caps = _caps(Surface(vertices, triangles))
     if caps:
         done.append(f"closed {len(caps)} flat holes")
-        groups = np.concatenate([groups, np.repeat(n_groups + np.arange(len(caps)), list(map(len, caps)))])
+        groups = np.concatenate([groups, np.repeat(len(names) + np.arange(len(caps)), list(map(len, caps)))])
+        names += tuple(f"hole-{k + 1}" for k in range(len(caps)))
         triangles = np.concatenate([triangles, *caps])
     turned = _flips(triangles)
     triangles[turned] = triangles[turned, ::-1]
@@ -213,19 +216,18 @@ def repaired(surface: Surface, groups: np.ndarray, n_groups: int) -> tuple[Surfa
         done.append(f"united {len(met)} parts that cross or touch")
         vertices, triangles, groups = _united(vertices, triangles, groups, met)
         _turn_outwards(vertices, triangles, _shells(pair_sides(vertices, triangles)[0]), nested=True)
-    return Surface(vertices, triangles, surface.name), groups, tuple(done), len(caps)
+    return Skin(Surface(vertices, triangles, surface.name), groups, names, (*skin.done, *done))
 
 
-def grounded(
-    surface: Surface, groups: np.ndarray, names: tuple[str, ...], bottom: float
-) -> tuple[Surface, np.ndarray, tuple[str, ...]]:
-    """Return the surface of the ground below a sheet, down to the height z = `bottom`, its groups, and their names.
+def grounded(skin: Skin, bottom: float) -> Skin:
+    """Return the surface of the ground below a sheet, down to the height z = `bottom`.
 
     Walls lead down from the open edges of the sheet. They and the bottom are the groups side and bottom.
 
     Raises `InputError` if the sheet has no open edges, is not above the bottom, or its border crosses itself seen from
     above.
     """
+    surface, groups, names, done = skin
     check_number(f"{surface.name} bottom", bottom)
     vertices, triangles = surface.welded
     low = vertices[np.unique(triangles)][:, 2].min()
@@ -252,7 +254,7 @@ def grounded(
     added = np.repeat([names.index("side"), names.index("bottom")], [len(walls), len(flat)])
     vertices = np.concatenate([vertices, np.column_stack([vertices[:, :2], np.full(under, float(bottom))])])
     triangles = np.concatenate([triangles, walls, flat[:, ::-1] + under])
-    return Surface(vertices, triangles, surface.name), np.concatenate([groups, added]), names
+    return Skin(Surface(vertices, triangles, surface.name), np.concatenate([groups, added]), names, done)
 
 
 def _united(
@@ -260,11 +262,10 @@ def _united(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return vertices, triangles and groups of a surface of which `shells` are replaced by their union."""
     names = [str(k) for k in range(int(groups.max()) + 1)]
-    one = boolean("+", *((vertices, triangles[shell], groups[shell], names) for shell in shells))
+    united = boolean("+", *(NamedTriangles(vertices, triangles[shell], groups[shell], names) for shell in shells))
     alone = np.setdiff1d(np.arange(len(triangles)), np.concatenate(shells))
-    united = (one["vertices"], one["triangles"], one["groups"], names)
-    one = merged([united, (vertices, triangles[alone], groups[alone], names)])
-    return *Surface(one["vertices"], one["triangles"]).welded, one["groups"]
+    one = NamedTriangles.merged([united, NamedTriangles(vertices, triangles[alone], groups[alone], names)])
+    return *Surface(one.vertices, one.triangles).welded, one.numbers(names)
 
 
 def _folds(triangles: np.ndarray, repeated: np.ndarray) -> np.ndarray:

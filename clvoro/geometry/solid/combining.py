@@ -7,48 +7,35 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ...errors import InputError, MissingLibraryError
+from ..triangles import NamedTriangles
 
 if TYPE_CHECKING:
     from .solid import Solid
 
 _ON_SIDE = 1e-9
 """Distance of vertices of a body from a side of its box, over the extent of the box, up to which they are on it."""
-NamedTriangles = tuple[np.ndarray, np.ndarray, np.ndarray, list[str]]
-"""Vertices (v, 3), triangles (t, 3), group of each triangle (t,), and the names of the groups."""
 
 
 def named_triangles(solid: Solid) -> NamedTriangles:
     """Return the surface of a solid with its names as groups."""
-    names = solid.boundaries
-    return solid.surface.vertices, solid.surface.triangles, names.index[solid.patch].astype(np.int64), list(names.names)
+    names, surface = solid.boundaries, solid.surface
+    return NamedTriangles(surface.vertices, surface.triangles, names.index[solid.patch].astype(np.int64), names.names)
 
 
-def merged(parts: list[NamedTriangles]) -> dict[str, Any]:
-    """Return the arguments of a solid from several surfaces. Groups of one name become one."""
-    names = list(dict.fromkeys(name for part in parts for name in part[3]))
-    starts = np.cumsum([0, *(len(part[0]) for part in parts)])
-    groups = [np.array([names.index(name) for name in part[3]])[part[2]] for part in parts]
-    return {
-        "vertices": np.concatenate([part[0] for part in parts]),
-        "triangles": np.concatenate([part[1] + start for part, start in zip(parts, starts[:-1], strict=True)]),
-        "groups": np.concatenate(groups),
-        "group_names": names,
-    }
-
-
-def around(body: Solid, box: Solid) -> dict[str, Any]:
-    """Return the arguments of the region of a box around a body.
+def around(body: Solid, box: Solid) -> NamedTriangles:
+    """Return the surface of the region of a box around a body.
 
     Names of the body that a side of the box has get the prefix ``body-``.
     """
-    vertices, triangles, groups, names = named_triangles(body)
+    vertices, triangles, _, names = own = named_triangles(body)
+    groups = own.numbers(names)
     outside = (body.shell_volumes > 0)[body.shells[1]]
     sides = box.boundary_names
     names = [f"body-{name}" if name in sides else name for name in names]
     inside = (np.array(body.lower) > box.lower).all() and (np.array(body.upper) < box.upper).all()
     if inside:
         turned = triangles[outside][:, ::-1]
-        return merged([named_triangles(box), (vertices, turned, groups[outside], names)])
+        return NamedTriangles.merged([named_triangles(box), NamedTriangles(vertices, turned, groups[outside], names)])
     if not ((np.array(body.upper) > box.lower).all() and (np.array(body.lower) < box.upper).all()):
         raise InputError(
             f"Solid.outside got a body from {body.lower} to {body.upper} and a box from {box.lower} to {box.upper}, "
@@ -57,7 +44,7 @@ def around(body: Solid, box: Solid) -> dict[str, Any]:
     # A body that stands on a side is on it up to round-off only.
     for side in (np.array(box.lower), np.array(box.upper)):
         vertices = np.where(np.abs(vertices - side) < _ON_SIDE * box.extent.max(), side, vertices)
-    return boolean("-", named_triangles(box), (vertices, triangles[outside], groups[outside], names))
+    return boolean("-", named_triangles(box), NamedTriangles(vertices, triangles[outside], groups[outside], names))
 
 
 def library() -> Any:
@@ -75,24 +62,24 @@ def library() -> Any:
     return manifold3d
 
 
-def boolean(operation: str, *parts: NamedTriangles, simpler: float = 0.0) -> dict[str, Any]:
-    """Return the arguments of the sum (+) or common part (^) of solids, or of the first without the others (-).
+def boolean(operation: str, *parts: NamedTriangles, simpler: float = 0.0) -> NamedTriangles:
+    """Return the surface of the sum (+) or common part (^) of solids, or of the first without the others (-).
 
     Triangles become fewer where the surface moves by less than the distance `simpler`.
 
     Raises `MissingLibraryError` if manifold3d is not installed. Raises `InputError` if nothing is left.
     """
     manifold3d = library()
-    names = list(dict.fromkeys(name for part in parts for name in part[3]))
+    names = tuple(dict.fromkeys(name for part in parts for name in part.names))
     start = manifold3d.Manifold.reserve_ids(len(names))
     manifolds = []
-    for vertices, triangles, groups, own in parts:
-        number = np.array([names.index(name) for name in own])[groups]
+    for part in parts:
+        number = part.numbers(names)
         order = np.argsort(number, kind="stable")
         used, begin = np.unique(number[order], return_index=True)
         mesh = manifold3d.Mesh64(
-            np.array(vertices, np.float64),
-            np.array(triangles[order], np.uint64),
+            np.array(part.vertices, np.float64),
+            np.array(part.triangles[order], np.uint64),
             run_index=(3 * np.append(begin, len(order))).astype(np.uint64),
             run_original_id=(start + used).astype(np.uint32),
         )
@@ -107,9 +94,5 @@ def boolean(operation: str, *parts: NamedTriangles, simpler: float = 0.0) -> dic
         raise InputError("a boolean of solids leaves nothing, expected a region; do the solids overlap?")
     lengths = np.diff(np.asarray(result.run_index).astype(np.int64)) // 3
     groups = np.repeat(np.asarray(result.run_original_id).astype(np.int64) - start, lengths)
-    return {
-        "vertices": np.asarray(result.vert_properties)[:, :3],
-        "triangles": np.asarray(result.tri_verts).astype(np.int64),
-        "groups": groups,
-        "group_names": names,
-    }
+    vertices, triangles = np.asarray(result.vert_properties)[:, :3], np.asarray(result.tri_verts).astype(np.int64)
+    return NamedTriangles(vertices, triangles, groups, names)

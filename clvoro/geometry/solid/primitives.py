@@ -1,10 +1,9 @@
-"""Surfaces of simple solids, as the arguments of `Solid`."""
+"""Surfaces of simple solids, with their names."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import scipy
@@ -13,12 +12,13 @@ import shapely
 from ...arguments import check_number, check_rows
 from ...errors import InputError
 from ..polygon import Polygon
-from ..surface import box_surface
+from ..surface import Surface, box_surface
+from ..triangles import NamedTriangles
 
 _FINE = 16  # edges of triangles per radius
 
 
-def box(lower: Sequence[float], upper: Sequence[float]) -> dict[str, Any]:
+def box(lower: Sequence[float], upper: Sequence[float]) -> NamedTriangles:
     """Return the surface of a box, with its sides as groups."""
     _require("box", None, lower, upper)
     if not (np.asarray(lower) < np.asarray(upper)).all():
@@ -26,12 +26,7 @@ def box(lower: Sequence[float], upper: Sequence[float]) -> dict[str, Any]:
     surface = box_surface(np.asarray(lower, float), np.asarray(upper, float))
     triangles = surface.triangles.reshape(6, 2, 3)[[4, 5, 2, 3, 0, 1]].reshape(-1, 3)
     sides = tuple(f"{axis}{end}" for axis in "xyz" for end in ("Min", "Max"))
-    return {
-        "vertices": surface.vertices,
-        "triangles": triangles,
-        "groups": np.repeat(np.arange(6), 2),
-        "group_names": sides,
-    }
+    return NamedTriangles(surface.vertices, triangles, np.repeat(np.arange(6), 2), sides)
 
 
 def _require(shape: str, edge: float | None, *points: Sequence[float], **sizes: float) -> None:
@@ -43,7 +38,7 @@ def _require(shape: str, edge: float | None, *points: Sequence[float], **sizes: 
         raise InputError(f"Solid.{shape} got the points {points}, expected finite numbers, and ends that differ")
 
 
-def ball(center: Sequence[float], radius: float, edge: float | None) -> dict[str, Any]:
+def ball(center: Sequence[float], radius: float, edge: float | None) -> NamedTriangles:
     """Return a sphere: an icosahedron whose sides are divided into squares of n triangles each."""
     _require("ball", edge, center, radius=radius)
     n = max(1, math.ceil((radius / _FINE if edge is None else edge) ** -1 * radius * 1.1))
@@ -66,7 +61,7 @@ def ball(center: Sequence[float], radius: float, edge: float | None) -> dict[str
     # Points on common sides differ by round-off.
     _, first, same = np.unique(np.round(points.reshape(-1, 3), 9), axis=0, return_index=True, return_inverse=True)
     vertices = np.asarray(center, float) + radius * points.reshape(-1, 3)[first]
-    return {"vertices": vertices, "triangles": same.reshape(-1)[triangles], "group_names": ("wall",)}
+    return NamedTriangles(vertices, same.reshape(-1)[triangles])
 
 
 def placed(begin: Sequence[float], end: Sequence[float], flat: np.ndarray) -> np.ndarray:
@@ -79,7 +74,7 @@ def placed(begin: Sequence[float], end: Sequence[float], flat: np.ndarray) -> np
     return np.asarray(begin, float) + flat @ np.stack([u, np.cross(along, u), along])
 
 
-def cylinder(begin: Sequence[float], end: Sequence[float], radius: float, edge: float | None) -> dict[str, Any]:
+def cylinder(begin: Sequence[float], end: Sequence[float], radius: float, edge: float | None) -> NamedTriangles:
     """Return a cylinder around the axis from `begin` to `end`, with the groups side, bottom and top."""
     _require("cylinder", edge, begin, end, radius=radius)
     height = float(np.linalg.norm(np.subtract(end, begin)))
@@ -103,15 +98,12 @@ def cylinder(begin: Sequence[float], end: Sequence[float], radius: float, edge: 
     )
     bottom = np.column_stack([np.full(n, len(wall)), after, k])
     top = np.column_stack([np.full(n, len(wall) + 1), n * rows + k, n * rows + after])
-    return {
-        "vertices": placed(begin, end, flat),
-        "triangles": np.concatenate([side, bottom, top]),
-        "groups": np.repeat([0, 1, 2], [len(side), n, n]),
-        "group_names": ("side", "bottom", "top"),
-    }
+    groups = np.repeat([0, 1, 2], [len(side), n, n])
+    triangles = np.concatenate([side, bottom, top])
+    return NamedTriangles(placed(begin, end, flat), triangles, groups, ("side", "bottom", "top"))
 
 
-def turned(profile: Sequence[Sequence[float]], edge: float | None) -> dict[str, Any]:
+def turned(profile: Sequence[Sequence[float]], edge: float | None) -> NamedTriangles:
     """Return what a closed profile of points (radius, height) sweeps around the z axis.
 
     Each edge of the profile is a group, numbered from 0; edges on the axis have no surface.
@@ -143,37 +135,28 @@ def turned(profile: Sequence[Sequence[float]], edge: float | None) -> dict[str, 
         groups.append(np.full(new * n, i if turn > 0 else j))
     names = tuple(f"edge-{i}" for i in range(len(points)))
     vertices[np.repeat(points[:, 0] == 0, n), :2] = 0
-    return {
-        "vertices": vertices,
-        "triangles": np.concatenate(triangles),
-        "groups": np.concatenate(groups),
-        "group_names": names,
-    }
+    return NamedTriangles(vertices, np.concatenate(triangles), np.concatenate(groups), names)
 
 
-def cone(begin: Sequence[float], end: Sequence[float], radius: float, edge: float | None) -> dict[str, Any]:
+def cone(begin: Sequence[float], end: Sequence[float], radius: float, edge: float | None) -> NamedTriangles:
     """Return a cone with the base around `begin` and the tip `end`, with the groups bottom and side."""
     _require("cone", edge, begin, end, radius=radius)
     height = float(np.linalg.norm(np.subtract(end, begin)))
     made = turned([(0, 0), (radius, 0), (0, height)], edge)
-    return {**made, "vertices": placed(begin, end, made["vertices"]), "group_names": ("bottom", "side")}
+    return made._replace(vertices=placed(begin, end, made.vertices), names=("bottom", "side"))
 
 
-def torus(center: Sequence[float], radius: float, tube: float, edge: float | None) -> dict[str, Any]:
+def torus(center: Sequence[float], radius: float, tube: float, edge: float | None) -> NamedTriangles:
     """Return a torus around an axis in z."""
     _require("torus", edge, center, radius=radius, tube=tube)
     n = max(12, math.ceil(2 * math.pi * tube / (tube / _FINE if edge is None else edge)))
     angle = 2 * math.pi * np.arange(n) / n
     profile = np.column_stack([radius + tube * np.cos(angle), tube * np.sin(angle)])
     made = turned(profile.tolist(), tube / _FINE if edge is None else edge)
-    return {
-        "vertices": made["vertices"] + np.asarray(center, float),
-        "triangles": made["triangles"],
-        "group_names": ("wall",),
-    }
+    return NamedTriangles(made.vertices + np.asarray(center, float), made.triangles)
 
 
-def extruded(polygon: Polygon, bottom: float, top: float) -> dict[str, Any]:
+def extruded(polygon: Polygon, bottom: float, top: float) -> NamedTriangles:
     """Return a polygon with its holes between two heights. The groups are those of the polygon, bottom and top."""
     if not bottom < top:
         raise InputError(f"Solid.extruded got bottom {bottom!r} and top {top!r}, expected bottom < top")
@@ -195,15 +178,11 @@ def extruded(polygon: Polygon, bottom: float, top: float) -> dict[str, Any]:
     names = (*polygon.boundary_names, "bottom", "top")
     part = polygon.boundary_index[wall]
     lids = np.repeat([len(names) - 2, len(names) - 1], len(flat))
-    return {
-        "vertices": corners.reshape(-1, 3),
-        "triangles": np.arange(3 * len(corners)).reshape(-1, 3),
-        "groups": np.concatenate([lids, part, part]),
-        "group_names": names,
-    }
+    triangles = np.arange(3 * len(corners)).reshape(-1, 3)
+    return NamedTriangles(corners.reshape(-1, 3), triangles, np.concatenate([lids, part, part]), names)
 
 
-def polyhedron(normals: object, offsets: object) -> dict[str, Any]:
+def polyhedron(normals: object, offsets: object) -> NamedTriangles:
     """Return the convex polyhedron of the points x with normals . x <= offsets; each half-space is a group."""
     n, d = np.atleast_2d(np.asarray(normals, float)), np.atleast_1d(np.asarray(offsets, float))
     if n.ndim != 2 or n.shape[1] != 3 or d.shape != (len(n),) or not (np.isfinite(n).all() and np.isfinite(d).all()):
@@ -227,10 +206,5 @@ def polyhedron(normals: object, offsets: object) -> dict[str, Any]:
     flip = np.einsum("ij,ij->i", np.cross(b - a, c - a), hull.equations[:, :3]) < 0
     triangles = np.where(flip[:, None], hull.simplices[:, ::-1], hull.simplices)
     size = float(np.ptp(points, axis=0).max())
-    return {
-        "vertices": points,
-        "triangles": triangles,
-        "groups": group,
-        "group_names": tuple(f"plane-{k}" for k in range(len(n))),
-        "join": 1e-9 * size,
-    }
+    vertices, triangles = Surface(points, triangles, "Solid.polyhedron", 1e-9 * size).welded
+    return NamedTriangles(vertices, triangles, group, [f"plane-{k}" for k in range(len(n))])

@@ -8,9 +8,10 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from numbers import Real
 from os import PathLike
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import scipy
 
 from ...arguments import check_rows, format_point, warn
 from ...errors import InputError, MismatchWarning
@@ -23,11 +24,11 @@ from ..nearest_triangles import Feet, NearestTriangles, heights_over
 from ..polygon import Polygon
 from ..shapes import Edges
 from ..surface import Surface
-from ..surface_files import SOLIDS, FilePath, parts_of, read_parts, solid_arguments, unit_length
-from ..triangles import areas_of, pierced
+from ..surface_files import SOLIDS, FilePath, named_parts, parts_of, read_parts, unit_length
+from ..triangles import NamedTriangles, pierced
 from ..wall_triangles import WallTriangles
 from . import primitives
-from .checks import grounded, repaired, require_bounding, sharp_edges, volume_inside
+from .checks import sharp_edges, volume_inside
 from .combining import around, boolean, named_triangles
 from .creases import (
     CONCAVE,
@@ -39,8 +40,12 @@ from .creases import (
     find_creases,
     triangle_normals,
 )
+from .preparation import Preparation, ShapeOptions, SolidOptions, prepared
 from .stations import Stations, place_stations
-from .wrapping import kept_groups, wrapped
+from .wrapping import kept_groups
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
 
 _ON = 1e-12  # of the diagonal: points this close to the surface lie on it
 _PROBES = 4096  # places on the surface from which widths are measured
@@ -65,21 +70,21 @@ class Solid(Domain):
         A number for each triangle. Triangles of different groups belong to different patches, even on a flat wall.
     group_names : sequence of str, optional
         The names of the groups 0, 1, ...; by default ``group-0``, ... Without `groups` the whole surface has the first
-        one; by default ``wall``.
+        one; by default `name`, or ``wall``.
     names : mapping, optional
         Names of boundaries, each with its patches: numbers, names of groups, or a sequence of them.
     angle : float, optional
         Edges at which the surface turns by more than this are creases, in degrees; by default 30, or 150 with `wrap`.
+    creases : (e, 2) int, optional
+        More edges at which patches end, as pairs of vertices.
+    name : str, optional
+        Name of the solid in error messages, and of the boundary of a simple one, such as `box`.
     join : float
         Distance within which vertices count as one.
-    name : str
-        Name of the solid in error messages.
     repair : bool
         Whether to join vertices across small gaps, remove duplicate triangles, close flat holes, orient triangles and
         unite parts that cross or touch, with a warning that says what was done. Closed holes are boundaries with the
         names ``hole-1``, ... Other holes, and parts that cross themselves, stay errors.
-    creases : (e, 2) int, optional
-        More edges at which patches end, as pairs of vertices.
     wrap : float, optional
         Take a closed surface around all triangles in their place, whatever is wrong with them. It is about wrap / 2
         outside of them, and closes holes and gaps up to 2 wrap wide; sheets become plates as thick as `wrap`. What is
@@ -136,55 +141,26 @@ class Solid(Domain):
         group_names: Sequence[str] | None = None,
         names: Mapping[str, Walls] | None = None,
         angle: float | None = None,
-        join: float = 0.0,
-        name: str = "Solid",
-        repair: bool = False,
         creases: object = None,
-        wrap: float | None = None,
-        inside: Sequence[float] | None = None,
-        bottom: float | None = None,
+        name: str | None = None,
+        **preparation: Unpack[Preparation],
     ):
-        given = Surface(vertices, triangles, name, join)
-        group = _checked_groups(name, groups, len(given))
-        self.repairs: tuple[str, ...] = ()
-        given_area, given_volume = areas_of(given.corners), volume_inside(given.corners)
-        known = ["wall"] if group_names is None and groups is None else list(group_names or ())
-        known += [f"group-{g}" for g in range(len(known), int(group.max()) + 1)]
-        self._group_names = tuple(known)
-        if bottom is not None:
-            repair = True
-            given, group, self._group_names = grounded(given, group, self._group_names, bottom)
-            known = list(self._group_names)
-        if repair:
-            given, group, self.repairs, holes = repaired(given, group, len(known))
-            self._group_names += tuple(f"hole-{k + 1}" for k in range(holes))
-        if wrap is None and inside is not None:
-            raise InputError(f"{name} has inside without wrap, expected a point in the space that a wrap bounds")
-        if wrap is not None:
-            if creases is not None:
-                raise InputError(f"{name} has creases and wrap, expected one of them: a wrap has other vertices")
-            rest = known[0] if len(known) == 1 else "wall"
-            given, group, self._group_names, done = wrapped(
-                given, wrap, inside, group, self._group_names, kept_groups(name, names, self._group_names), rest
-            )
-            self.repairs = (*self.repairs, done)
-            angle = _WRAPPED if angle is None else angle
-        places, merged = given.welded
-        self._places = given.places
-        whole = (merged != np.roll(merged, -1, axis=1)).all(axis=1)
-        self._group, merged = group[whole], merged[whole]
-        self.surface = Surface(places, merged, name)
-        parts = [self._group_names[g] for g in group.tolist()]
-        self.twin = require_bounding(given, places, merged, parts, repair)
-        angle = 30 if angle is None else angle
+        if groups is None and group_names is None:
+            group_names = [name or "wall"]
+        name, wraps = name or "Solid", preparation.get("wrap") is not None
+        if creases is not None and wraps:
+            raise InputError(f"{name} has creases and wrap, expected one of them: a wrap has other vertices")
+        skin, self.twin = prepared(vertices, triangles, groups, group_names, names, name, **preparation)
+        self.surface, self._group, self._group_names, _ = skin
+        angle = (_WRAPPED if wraps else 30) if angle is None else angle
         if not (isinstance(angle, Real) and 0 < angle < 180):
             raise InputError(f"{name} angle is {angle!r}, expected degrees between 0 and 180")
         self.angle = float(angle)
-        vertices, triangles = self.surface.vertices, self.surface.triangles
+        given, vertices, triangles = vertices, self.surface.vertices, self.surface.triangles
         self.normals, self._areas = triangle_normals(vertices, triangles, self.twin)
         turns = dihedral_turns(vertices, triangles, self.twin, self.normals)
         across = self._group[self.twin // 3] != np.repeat(self._group, 3)
-        border = (np.abs(turns) > math.radians(self.angle)) | across | self._drawn(creases)
+        border = (np.abs(turns) > math.radians(self.angle)) | across | self._drawn(given, creases)
         if self.angle >= 90:  # a wrap is rough, and borders of its groups are convex or concave as a whole
             even_turns(turns, self.twin, self._group, across)
         self.patch, self.creases, self.corners = find_creases(vertices, triangles, self.twin, turns, border)
@@ -193,13 +169,6 @@ class Solid(Domain):
         self.lower, self.upper = tuple(lower.tolist()), tuple(upper.tolist())
         self.names = names
         self.names = self._checked_names()
-        if self.repairs:
-            before, after = float(np.nansum(given_area)), self.boundary_measure
-            warn(
-                f"{name} was repaired: {'; '.join(self.repairs)}. Its area was {before:.6g} and is {after:.6g}, its "
-                f"volume was {given_volume:.6g} and is {self.measure:.6g}",
-                MismatchWarning,
-            )
         sharp = sharp_edges(self.creases.angle)
         if sharp.size:
             where = vertices[self.creases.edges[sharp[0]]].mean(axis=0)
@@ -209,28 +178,27 @@ class Solid(Domain):
                 MismatchWarning,
             )
 
-    def _drawn(self, creases: object) -> np.ndarray:
-        """Return the sides of triangles (3 t,) that are among the edges `creases`, given as places of vertices."""
-        triangles = self.surface.triangles
+    def _drawn(self, vertices: object, creases: object) -> np.ndarray:
+        """Return the sides of triangles (3 t,) that are among the edges `creases` between the caller's `vertices`."""
+        triangles, name, given = self.surface.triangles, self.surface.name, np.asarray(vertices, float)
         self._drawn_edges = np.zeros((0, 2), np.int64)
         if creases is None:
-            return np.zeros(3 * len(triangles), bool)
+            return np.zeros(triangles.size, bool)
         edges = np.asarray(creases)
         if edges.ndim != 2 or edges.shape[1] != 2 or edges.dtype.kind not in "iu":
-            raise InputError(
-                f"{self.surface.name} creases have shape {edges.shape}, expected pairs of vertices (e, 2) int"
-            )
+            raise InputError(f"{name} creases have shape {edges.shape}, expected pairs of vertices (e, 2) int")
+        if edges.size and not (0 <= edges.min() and edges.max() < len(given)):
+            raise InputError(f"{name} creases have vertices up to {edges.max()}, expected those of the surface")
         n = len(self.surface.vertices)
-        if edges.size and not (0 <= edges.min() and edges.max() < len(self._places)):
-            raise InputError(
-                f"{self.surface.name} creases have vertices up to {edges.max()}, expected those of the surface"
-            )
-        edges = self._drawn_edges = np.sort(self._places[edges], axis=1)
+        place = scipy.spatial.KDTree(self.surface.vertices).query(given[edges.reshape(-1)])[1]
+        edges = self._drawn_edges = np.sort(place.reshape(-1, 2), axis=1)
         ends = np.sort(np.stack([triangles, np.roll(triangles, -1, axis=1)], axis=2).reshape(-1, 2), axis=1)
         return np.isin(ends @ (n, 1), edges @ (n, 1))
 
     @classmethod
-    def read(cls, path: FilePath | Sequence[FilePath], units: str | float | None = None, **options: Any) -> Solid:
+    def read(
+        cls, path: FilePath | Sequence[FilePath], units: str | float | None = None, **options: Unpack[SolidOptions]
+    ) -> Solid:
         """Read a solid from STL, OBJ, PLY, OFF or 3MF files with trimesh, or from a STEP file with Gmsh.
 
         Solids of an STL file, groups of an OBJ file, objects of a 3MF file and named faces of a STEP file give
@@ -255,22 +223,35 @@ class Solid(Domain):
             If the file needs a library that is not installed.
         """
         unit = unit_length(units)
-        arguments = solid_arguments(read_parts(path, SOLIDS), unit)
+        made = named_parts(read_parts(path, SOLIDS), unit)
         first, *others = [path] if isinstance(path, str | PathLike) else path
         name = f"solid {str(first)!r}" + (f" with {len(others)} more files" if others else "")
         if others and options.get("wrap") is not None:
             names = options.get("names") or {}
-            left = set(arguments["group_names"]) - set(kept_groups(name, names, tuple(arguments["group_names"])))
-            options["names"] = {**{group: group for group in arguments["group_names"] if group in left}, **names}
-        return cls(**{**arguments, "name": name, **options})
+            left = set(made.names) - set(kept_groups(name, names, tuple(made.names)))
+            options["names"] = {**{group: group for group in made.names if group in left}, **names}
+        return cls._of(made, options, name)
 
     @classmethod
-    def from_trimesh(cls, mesh: Any, **options: Any) -> Solid:
+    def _of(cls, made: NamedTriangles, options: Any, title: str | None = None) -> Solid:
+        """Return the solid of a surface and the caller's `options`; a single name is for all its triangles.
+
+        - `title`: the name of a surface in messages; its groups are more than parts of a shape, and stay
+        """
+        named = "name" in options and (title is None or made.groups is None)
+        names = options.pop("group_names", [str(options["name"])] if named else made.names)
+        groups = options.pop("groups", None if len(names) == 1 else made.groups)
+        return cls(made.vertices, made.triangles, groups, names, **dict(name=title) | options)
+
+    @classmethod
+    def from_trimesh(cls, mesh: Any, **options: Unpack[SolidOptions]) -> Solid:
         """Return the solid inside of a ``trimesh.Trimesh``, or of all meshes of a ``trimesh.Scene`` and their names."""
-        return cls(**{**solid_arguments(parts_of(mesh), 1.0), **options})
+        return cls._of(named_parts(parts_of(mesh)), options, "Solid")
 
     @classmethod
-    def outside(cls, of: Solid, box: Box | tuple[Sequence[float], Sequence[float]], **options: Any) -> Solid:
+    def outside(
+        cls, of: Solid, box: Box | tuple[Sequence[float], Sequence[float]], **options: Unpack[SolidOptions]
+    ) -> Solid:
         """Return the region of a box around a body, for external flow.
 
         The sides of the box have the names xMin, xMax, ..., or those of a `Box`; the others are those of the body.
@@ -294,11 +275,11 @@ class Solid(Domain):
         frame = cls.box(lower, upper, names=box.names if isinstance(box, Box) else None)
         made = around(of, frame)
         if of.angle >= 90:  # the edges of the box stay creases
-            x, triangles = made["vertices"], made["triangles"]
+            x, triangles = made.vertices, made.triangles
             on = np.isclose(np.hstack([x, x]), np.hstack([lower, upper]), rtol=0, atol=_ON * frame.extent.max())
             ends = np.stack([triangles, np.roll(triangles, -1, axis=1)], axis=2).reshape(-1, 2)
-            made["creases"] = np.unique(np.sort(ends[on[ends].all(axis=1).sum(axis=1) > 1], axis=1), axis=0)
-        return cls(**{**made, "angle": of.angle, **options})
+            options["creases"] = np.unique(np.sort(ends[on[ends].all(axis=1).sum(axis=1) > 1], axis=1), axis=0)
+        return cls._of(made, {"angle": of.angle, **options}, "Solid")
 
     def __add__(self, other: Solid) -> Solid:
         return self._combined(other, "+")
@@ -313,65 +294,78 @@ class Solid(Domain):
         """Return a boolean of two solids; names stay."""
         if not isinstance(other, Solid):
             return NotImplemented
-        return Solid(**boolean(operation, named_triangles(self), named_triangles(other)), angle=self.angle)
+        return Solid(*boolean(operation, named_triangles(self), named_triangles(other)), angle=self.angle)
 
     @classmethod
-    def _simple(cls, made: dict[str, Any], options: dict[str, Any]) -> Solid:
-        """Return a simple solid from its arguments and the caller's `options`; a single name is for all its sides."""
-        single = len(options.get("group_names") or ()) == 1
-        return cls(**{**made, **({"groups": None} if single else {}), **options})
-
-    @classmethod
-    def box(cls, lower: Sequence[float], upper: Sequence[float], **options: Any) -> Solid:
+    def box(cls, lower: Sequence[float], upper: Sequence[float], **options: Unpack[ShapeOptions]) -> Solid:
         """Return a box; its sides have the names xMin, xMax, yMin, ..."""
-        return cls._simple(primitives.box(lower, upper), options)
+        return cls._of(primitives.box(lower, upper), options)
 
     @classmethod
     def cone(
-        cls, begin: Sequence[float], end: Sequence[float], radius: float, edge: float | None = None, **options: Any
+        cls,
+        begin: Sequence[float],
+        end: Sequence[float],
+        radius: float,
+        edge: float | None = None,
+        **options: Unpack[ShapeOptions],
     ) -> Solid:
         """Return a cone from its base around `begin` to its tip `end`, with the boundaries bottom and side."""
-        return cls._simple(primitives.cone(begin, end, radius, edge), options)
+        return cls._of(primitives.cone(begin, end, radius, edge), options)
 
     @classmethod
     def torus(
-        cls, center: Sequence[float], radius: float, tube: float, edge: float | None = None, **options: Any
+        cls,
+        center: Sequence[float],
+        radius: float,
+        tube: float,
+        edge: float | None = None,
+        **options: Unpack[ShapeOptions],
     ) -> Solid:
         """Return a torus around an axis in z: a tube of the radius `tube` around a circle of `radius`."""
-        return cls._simple(primitives.torus(center, radius, tube, edge), options)
+        return cls._of(primitives.torus(center, radius, tube, edge), options)
 
     @classmethod
-    def turned(cls, profile: Sequence[Sequence[float]], edge: float | None = None, **options: Any) -> Solid:
+    def turned(
+        cls, profile: Sequence[Sequence[float]], edge: float | None = None, **options: Unpack[ShapeOptions]
+    ) -> Solid:
         """Return what a closed profile of points (radius, height) sweeps around the z axis.
 
         The boundaries are edge-0, edge-1, ..., one for each edge of the profile that is not on the axis.
         """
-        return cls._simple(primitives.turned(profile, edge), options)
+        return cls._of(primitives.turned(profile, edge), options)
 
     @classmethod
-    def extruded(cls, polygon: Polygon, bottom: float, top: float, **options: Any) -> Solid:
+    def extruded(cls, polygon: Polygon, bottom: float, top: float, **options: Unpack[ShapeOptions]) -> Solid:
         """Return a `Polygon`, with its holes, between two heights; its boundaries, and those named bottom and top."""
-        return cls._simple(primitives.extruded(polygon, bottom, top), options)
+        return cls._of(primitives.extruded(polygon, bottom, top), options)
 
     @classmethod
-    def polyhedron(cls, normals: object, offsets: object, **options: Any) -> Solid:
+    def polyhedron(cls, normals: object, offsets: object, **options: Unpack[ShapeOptions]) -> Solid:
         """Return the convex polyhedron of the points x with normals (m, 3) . x <= offsets (m,).
 
         The boundaries are plane-0, plane-1, ...
         """
-        return cls._simple(primitives.polyhedron(normals, offsets), options)
+        return cls._of(primitives.polyhedron(normals, offsets), options)
 
     @classmethod
-    def ball(cls, center: Sequence[float], radius: float, edge: float | None = None, **options: Any) -> Solid:
+    def ball(
+        cls, center: Sequence[float], radius: float, edge: float | None = None, **options: Unpack[ShapeOptions]
+    ) -> Solid:
         """Return a ball. `edge` is the length of the triangles' edges; by default a sixteenth of the radius."""
-        return cls._simple(primitives.ball(center, radius, edge), options)
+        return cls._of(primitives.ball(center, radius, edge), options)
 
     @classmethod
     def cylinder(
-        cls, begin: Sequence[float], end: Sequence[float], radius: float, edge: float | None = None, **options: Any
+        cls,
+        begin: Sequence[float],
+        end: Sequence[float],
+        radius: float,
+        edge: float | None = None,
+        **options: Unpack[ShapeOptions],
     ) -> Solid:
         """Return a cylinder around the axis from `begin` to `end`, with the boundaries side, bottom and top."""
-        return cls._simple(primitives.cylinder(begin, end, radius, edge), options)
+        return cls._of(primitives.cylinder(begin, end, radius, edge), options)
 
     @property
     def meeting_walls(self) -> np.ndarray:
@@ -801,16 +795,3 @@ class Solid(Domain):
 
 def _described(values: dict[str, Any]) -> Solid:
     return Solid.described(**values)
-
-
-def _checked_groups(name: str, groups: object, count: int) -> np.ndarray:
-    """Return the group of each triangle, (t,) int64; 0 by default."""
-    if groups is None:
-        return np.zeros(count, np.int64)
-    array = np.asarray(groups)
-    if array.shape != (count,) or array.dtype.kind not in "iu" or (array < 0).any():
-        raise InputError(
-            f"{name} groups have shape {array.shape} and dtype {array.dtype}, expected one number, 0 or more, for each "
-            f"of the {count} triangles"
-        )
-    return array.astype(np.int64)

@@ -21,8 +21,8 @@ import scipy
 from ...arguments import format_point
 from ...errors import InputError
 from ..nearest_triangles import NearestTriangles
-from ..surface import Surface
-from ..triangles import areas_of, packed_weights
+from ..surface import Skin, Surface
+from ..triangles import NamedTriangles, areas_of, packed_weights
 from .checks import repeated_triangles
 from .combining import boolean, library
 from .creases import connect, pair_sides
@@ -71,25 +71,17 @@ def kept_groups(name: str, names: object, groups: tuple[str, ...]) -> list[str]:
     return [wall for wall in kept if wall in groups and len(groups) > 1]
 
 
-def wrapped(
-    surface: Surface,
-    reach: float,
-    inside: Sequence[float] | None,
-    groups: np.ndarray,
-    names: tuple[str, ...],
-    kept: list[str],
-    rest: str,
-) -> tuple[Surface, np.ndarray, tuple[str, ...], str]:
-    """Return a closed surface around all triangles, its groups and their names, and what was done.
+def wrapped(skin: Skin, reach: float, inside: Sequence[float] | None, kept: list[str], rest: str) -> Skin:
+    """Return a closed surface around all triangles. Each place of it has the group of the nearest triangle.
 
     - `inside`: a point: the surface is that of the space around it
-    - `groups` (t,) int, `names`: groups of the triangles. Each place of the wrap has that of the nearest triangle.
     - `kept`: the groups that stay; others become one with the name `rest`.
 
     Raises `InputError` if `reach` is no length, longer than the surface, or so small that the grid would have too many
     points; if `inside` is no point in a space that triangles close off up to gaps 2 `reach` wide; or if a group has no
     place. Raises `MissingLibraryError` if manifold3d is not installed.
     """
+    surface, groups, names, done = skin
     name = surface.name
     middle = (surface.vertices.min(axis=0) + surface.vertices.max(axis=0)) / 2
     near = Surface(surface.vertices - middle, surface.triangles, name)  # round-off as at the origin
@@ -105,18 +97,19 @@ def wrapped(
     made, group = _with_groups(grid.level(name, sign * ((1 - _OFF) * reach - depth)), near, place[groups], reach)
     names = ("rest" if rest in kept else rest, *kept)
     for share in _SIMPLER:
-        result = boolean("+", (made.vertices, made.triangles, group, list(names)), simpler=share * step)
-        closed = Surface(result["vertices"] + middle, result["triangles"], name)
+        result = boolean("+", NamedTriangles(made.vertices, made.triangles, group, names), simpler=share * step)
+        closed = Surface(result.vertices + middle, result.triangles, name)
         if not (len(repeated_triangles(closed.welded[1])) or len(closed.crossings())):
             break
-    lost = [names[g] for g in range(1, len(names)) if not (result["groups"] == g).any()]
+    group = result.numbers(names)
+    lost = [names[g] for g in range(1, len(names)) if not (group == g).any()]
     if lost:
         raise InputError(
             f"{name} has no place for {lost[0]!r} on its wrap, which is nearer to other groups, or larger; "
             "leave out that group or its file, or use a smaller wrap"
         )
-    off = samples.distance(result["vertices"]).max()
-    return closed, result["groups"], names, f"wrapped, at most {off:.3g} away from what was given"
+    off = samples.distance(result.vertices).max()
+    return Skin(closed, group, names, (*done, f"wrapped, at most {off:.3g} away from what was given"))
 
 
 def _grid_around(surface: Surface, reach: float) -> _Sampled:

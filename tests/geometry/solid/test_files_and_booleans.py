@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from clvoro import Box, Solid
-from clvoro.errors import InputError, MismatchWarning
+from clvoro.errors import ClvoroError, InputError, MismatchWarning
 from clvoro.geometry.solid import wrapping
 
 CUBE = Solid.box((0, 0, 0), (1, 1, 1))
@@ -62,7 +62,8 @@ def test_a_step_file_is_read_in_meters_and_its_parts_are_united(tmp_path):
 
 
 def test_the_outside_of_a_body_has_the_names_of_both():
-    assert Solid.box((0, 0, 0), (1, 1, 1), group_names=["body"]).boundary_names == ("body",)
+    for option in ({"group_names": ["body"]}, {"name": "body"}):
+        assert Solid.box((0, 0, 0), (1, 1, 1), **option).boundary_names == ("body",)
     body = Solid.ball((0, 0, 0), 1, edge=0.3, group_names=("ball",))
     region = Solid.outside(body, Box((-2, -2, -2), (4, 2, 2), names={"inlet": "xMin"}))
     assert region.boundary_names == ("inlet", "xMax", "yMin", "yMax", "zMin", "zMax", "ball")
@@ -261,6 +262,8 @@ def test_edges_sharper_than_ten_degrees_are_warned_of():
     ("options", "says"),
     [
         ({"groups": [0, 1]}, "groups have shape"),
+        ({"name": "my part"}, "group_names has 'my part', expected a word"),
+        ({"wrp": 0.1}, "got 'wrp', expected an option of Solid: .*wrap"),
         ({"angle": 200}, "angle is 200"),
         ({"creases": [(0, 99)]}, "creases have vertices up to 99"),
         ({"names": {"inlet": "nowhere"}}, "nowhere"),
@@ -278,7 +281,7 @@ def test_edges_sharper_than_ten_degrees_are_warned_of():
     ],
 )
 def test_wrong_options_are_refused(options, says):
-    with pytest.raises(InputError, match=says):
+    with pytest.raises(ClvoroError, match=says):
         Solid(**{"vertices": V, "triangles": T, **options})
 
 
