@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
 from os import PathLike
-from typing import Any, Literal, NoReturn
+from typing import TYPE_CHECKING, Any, Literal, NoReturn
 
 import numpy as np
 import pyopencl as cl
@@ -22,15 +22,16 @@ from .adaptation.options import (
     MultilevelOptions,
     PaperOptions,
     RunArguments,
+    RunOptions,
     Start,
     check_callback,
 )
 from .adaptation.preparation import prepare
-from .adaptation.run import INTERRUPTED, Run, check_shared
+from .adaptation.run import INTERRUPTED, Run, check_shared, not_interrupted
 from .adaptation.stages import Stages
 from .adaptation.transport import RELAXED, power_diagram_of, transport_to
-from .arguments import check_choice, check_integer, check_points, coincident_named
-from .errors import InputError, InputTypeError, Interrupted, MemoryLimitError
+from .arguments import check_integer, check_points, coincident_named
+from .errors import InputError, InputTypeError, MemoryLimitError
 from .geometry.boundary_layers import Layers
 from .geometry.domain import Domain
 from .mesh.diagram import Diagram
@@ -42,6 +43,9 @@ from .opencl.prebuild import BuildNotice, renew, report_builds
 from .opencl.probe import check_process
 from .opencl.threads import Team, Threads
 from .tessellation.readback.diagram import make_diagram
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
 
 
 class Adapter:
@@ -422,7 +426,6 @@ class Adapter:
         options: MultilevelOptions | PaperOptions | None = None,
         checkpoint: str | PathLike[str] | Checkpoint | None = None,
         callback: Callable[[np.void], object] | None = None,
-        on_interrupt: Literal["raise", "return"] = "raise",
     ) -> Result:
         """Mesh `domain` by Voronoi cells of the target size.
 
@@ -479,8 +482,6 @@ class Adapter:
         callback : callable, optional
             Called with each new row of the history (fields as in `Result.history`: ``row["mean_error"]``, ...). The
             run stops if it returns True. Over ranks it is called where steps are taken: on rank 0 for each row.
-        on_interrupt : "raise" or "return"
-            What Ctrl-C does: raise `Interrupted`, which carries the result so far, or return that result.
 
         Returns
         -------
@@ -530,19 +531,13 @@ class Adapter:
         """
         given = {"effort": effort, "seed": seed, "max_steps": max_steps, "n_cells": n_cells, "layers": layers}
         arguments = RunArguments.of(domain, size, points, options, fixed, checkpoint, method=method, **given)
-        check_choice("on_interrupt", on_interrupt, ("raise", "return"))
         check_callback(callback)
         with self._alone():
             run = self._run_together if self._others else self._run
-            return run(arguments, callback, on_interrupt)
+            return not_interrupted(run(arguments, callback))
 
-    def _run(
-        self,
-        arguments: RunArguments,
-        callback: Callable[[np.void], object] | None,
-        on_interrupt: Literal["raise", "return"],
-    ) -> Result:
-        """Do what `run` does on this device."""
+    def _run(self, arguments: RunArguments, callback: Callable[[np.void], object] | None) -> Result:
+        """Do what `run` does on this device; after Ctrl-C return the mesh so far."""
         for kept in self._stages.values():
             kept.release()  # buffers of a diagram, or of a failed run, are not part of this run's memory
         stages = self._stages_for(arguments.domain, self._peers)
@@ -552,19 +547,14 @@ class Adapter:
             shown = self._shown(callback, notice)
             stages.engine.pool.on_work = self.on_work
             try:
-                return Run(stages, arguments, shown, self.on_memory).conclude(on_interrupt)
+                return Run(stages, arguments, shown, self.on_memory).conclude()
             except BaseException as error:
                 self._peers.fail(error)
                 raise
             finally:
                 stages.engine.pool.on_work = None
 
-    def _run_together(
-        self,
-        arguments: RunArguments,
-        callback: Callable[[np.void], object] | None,
-        on_interrupt: Literal["raise", "return"],
-    ) -> Result:
+    def _run_together(self, arguments: RunArguments, callback: Callable[[np.void], object] | None) -> Result:
         """Do the same on all devices, and return the whole mesh."""
         for other in self._others:
             other.on_build = lambda *_: None
@@ -576,33 +566,15 @@ class Adapter:
                 return peers.team.interrupted
 
             adapter = (self, *self._others)[peers.number]
-            return adapter._run(arguments, answer, on_interrupt).gather()
+            return adapter._run(arguments, answer).gather()
 
         result = self._team.run(work)[0]
         assert result is not None
         if not self._team.interrupted:
             return result
-        result = dataclasses.replace(result, converged=False, stop_reason=INTERRUPTED)
-        if on_interrupt == "raise":
-            raise Interrupted(result)
-        return result
+        return dataclasses.replace(result, converged=False, stop_reason=INTERRUPTED)
 
-    def start(
-        self,
-        domain: Domain,
-        size: object,
-        effort: EffortName = "default",
-        *,
-        points: ArrayLike | Start = "density",
-        method: MethodName = "adaptive",
-        n_cells: int | None = None,
-        layers: Layers | Sequence[Layers] = (),
-        fixed: ArrayLike | PathLike[str] | Mapping[str, Any] | None = None,
-        seed: int = 0,
-        max_steps: int | None = None,
-        options: MultilevelOptions | PaperOptions | None = None,
-        checkpoint: str | PathLike[str] | Checkpoint | None = None,
-    ) -> Run:
+    def start(self, domain: Domain, size: object, effort: EffortName = "default", **options: Unpack[RunOptions]) -> Run:
         """Start a run that goes on step by step, shows its mesh at any time, and follows other size fields.
 
         It has buffers of its own: the adapter may be used between two steps. Stepped to its end, it gives the same
@@ -611,8 +583,8 @@ class Adapter:
         Parameters
         ----------
         domain : Box, Polygon, Sphere or Solid
-        size, effort, points, method, n_cells, layers, fixed, seed, max_steps, options, checkpoint
-            As those of `run`.
+        size, effort, **options
+            As those of `run`, without `callback`.
 
         Returns
         -------
@@ -631,8 +603,7 @@ class Adapter:
         >>> run.finish().converged
         True
         """
-        given = {"effort": effort, "seed": seed, "max_steps": max_steps, "n_cells": n_cells, "layers": layers}
-        arguments = RunArguments.of(domain, size, points, options, fixed, checkpoint, method=method, **given)
+        arguments = RunArguments.of(domain, size, effort=effort, **options)
         if self._peers.shared:
             raise InputError(
                 "start is called with an Adapter that has comm or devices, expected run: they share whole runs"
@@ -647,17 +618,7 @@ class Adapter:
         with self._alone(), report_builds(stages.engine, self.on_build):
             yield
 
-    def memory_needed(
-        self,
-        domain: Domain,
-        size: object,
-        *,
-        points: ArrayLike | Start = "density",
-        method: MethodName = "adaptive",
-        n_cells: int | None = None,
-        layers: Layers | Sequence[Layers] = (),
-        options: MultilevelOptions | PaperOptions | None = None,
-    ) -> float:
+    def memory_needed(self, domain: Domain, size: object, **options: Unpack[RunOptions]) -> float:
         """Estimate the bytes that `run` needs on the device, or on each of several, with these arguments.
 
         A run of some thousand cells needs at most a quarter more, and no less than three quarters of it. Where sizes
@@ -668,8 +629,8 @@ class Adapter:
         Parameters
         ----------
         domain : Box, Polygon, Sphere or Solid
-        size, points, method, n_cells, layers, options
-            As those of `run`.
+        size, **options
+            As those of `run`, without `effort` and `callback`.
 
         Raises
         ------
@@ -685,7 +646,7 @@ class Adapter:
         >>> 5e6 < bytes_ < 7e6
         True
         """
-        arguments = RunArguments.of(domain, size, points, options, method=method, n_cells=n_cells, layers=layers)
+        arguments = RunArguments.of(domain, size, **options)
         with self._alone():
             stages = self._stages_for(domain, self._peers)
             return prepare(stages, arguments.checked(self.dtype)).memory

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import partial
 from numbers import Real
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple, TypedDict, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -287,6 +287,20 @@ class Options:
         return self.method in _MULTILEVEL
 
 
+class RunOptions(TypedDict, total=False):
+    """Arguments of `Adapter.run` beside the domain, the size, the effort and the callback."""
+
+    points: ArrayLike | Start
+    method: MethodName
+    n_cells: int | None
+    layers: Layers | Sequence[Layers]
+    fixed: ArrayLike | os.PathLike[str] | Mapping[str, Any] | None
+    seed: int
+    max_steps: int | None
+    options: MultilevelOptions | PaperOptions | None
+    checkpoint: str | os.PathLike[str] | Checkpoint | None
+
+
 class RunArguments(NamedTuple):
     """Arguments of `Adapter.run`."""
 
@@ -303,8 +317,8 @@ class RunArguments(NamedTuple):
         cls,
         domain: Domain,
         size: object,
-        points: ArrayLike | Start,
-        options: object,
+        points: ArrayLike | Start = "density",
+        options: object = None,
         fixed: object = None,
         checkpoint: object = None,
         **given: Any,

@@ -8,7 +8,7 @@ import math
 import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
@@ -43,6 +43,13 @@ MISSES = "plan ended, but the sizes are missed"
 COMPLETED, STALLED = "plan completed", "error and quality no longer improve"
 SETTLED = "tolerance of the moving mesh met"
 """Reasons of converged runs."""
+
+
+def not_interrupted(result: Result) -> Result:
+    """Return a result, or raise `Interrupted` with it if the run did not end."""
+    if result.stop_reason == INTERRUPTED:
+        raise Interrupted(result)
+    return result
 
 
 def check_shared(arguments: RunArguments) -> None:
@@ -270,21 +277,16 @@ class Run:
         with self._alone(self._stages):
             return self._advance()
 
-    def finish(self, on_interrupt: Literal["raise", "return"] = "raise") -> Result:
+    def finish(self) -> Result:
         """Go on to the end, and return the mesh.
-
-        Parameters
-        ----------
-        on_interrupt : "raise" or "return"
-            What Ctrl-C does: raise `Interrupted`, which carries the result so far, or return that result.
 
         Raises
         ------
         Interrupted
-            On Ctrl-C.
+            On Ctrl-C; it carries the mesh so far.
         """
         with self._alone(self._stages):
-            return self.conclude(on_interrupt)
+            return not_interrupted(self.conclude())
 
     def mesh(self) -> Result:
         """Return the mesh that the run would give if it ended now; the run goes on as if nothing had happened.
@@ -363,8 +365,8 @@ class Run:
         if self._writer is not None and (due or self._stop):
             self._writer.write_if_due(self, self._stop)
 
-    def conclude(self, on_interrupt: Literal["raise", "return"] = "raise") -> Result:
-        """Do as `finish`, for a caller that excludes other threads."""
+    def conclude(self) -> Result:
+        """Do as `finish`, for a caller that excludes other threads; after Ctrl-C return the mesh so far."""
         if self._result is None:
             try:
                 while self._advance():
@@ -380,8 +382,6 @@ class Run:
                 if self._writer is not None and resumable and self.rows:
                     self._writer.write_if_due(self, stop=True)
             self._result = self._end()
-        if self._result.stop_reason == INTERRUPTED and on_interrupt == "raise":
-            raise Interrupted(self._result)
         return self._result
 
     @property

@@ -22,7 +22,7 @@ import numpy as np
 from .. import earth
 from ..adaptation.options import Checkpoint, Options, arguments_of_run, uses, warn_of_unused
 from ..adaptation.run import INTERRUPTED, MISSES
-from ..errors import Aborted, ClvoroError, InputError, SolverWarning
+from ..errors import Aborted, ClvoroError, InputError, Interrupted, SolverWarning
 from ..finite_volumes.gate import Solver
 from ..finite_volumes.solver_mesh import WallShape
 from ..io import save, write, write_history
@@ -226,14 +226,10 @@ class Job:
             adapter.on_memory, adapter.on_build = announce, show_builds
             adapter.on_work = None if shown is None else shown.show_work
             try:
-                result: Result = adapter.run(
-                    self.case.domain,
-                    size,
-                    callback=callback,
-                    checkpoint=self._state,
-                    on_interrupt="return",
-                    **arguments,
-                )
+                domain, state = self.case.domain, self._state
+                result: Result = adapter.run(domain, size, callback=callback, checkpoint=state, **arguments)
+            except Interrupted as stopped:
+                result = stopped.result
             finally:
                 adapter.on_memory = adapter.on_build = adapter.on_work = None
         self.interrupted = self.peers.any(self.interrupted or result.stop_reason == INTERRUPTED)

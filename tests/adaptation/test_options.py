@@ -128,8 +128,6 @@ def test_bad_options(make, error, message):
 def test_options_of_a_kind(adapter):
     with pytest.raises(InputTypeError, match=r"options is .*expected clvoro.MultilevelOptions"):
         adapter.run(BOX, 0.3, options={"tol": 0})
-    with pytest.raises(InputError, match="on_interrupt is 'stop', expected one of raise, return"):
-        adapter.run(BOX, 0.3, on_interrupt="stop")
     with pytest.warns(UnusedOptionWarning, match="no checkpoint is written") as caught:
         Checkpoint(every=5)
     assert caught[0].filename == __file__

@@ -79,22 +79,23 @@ class Solid(Domain):
         More edges at which patches end, as pairs of vertices.
     name : str, optional
         Name of the solid in error messages, and of the boundary of a simple one, such as `box`.
-    join : float
-        Distance within which vertices count as one.
-    repair : bool
-        Whether to join vertices across small gaps, remove duplicate triangles, close flat holes, orient triangles and
-        unite parts that cross or touch, with a warning that says what was done. Closed holes are boundaries with the
-        names ``hole-1``, ... Other holes, and parts that cross themselves, stay errors.
-    wrap : float, optional
-        Take a closed surface around all triangles in their place, whatever is wrong with them. It is about wrap / 2
-        outside of them, and closes holes and gaps up to 2 wrap wide; sheets become plates as thick as `wrap`. What is
-        finer is left out, with sharp edges. Groups that `names` mentions stay, all others become one: ``wall``. A
-        warning says how far the surface is from the triangles at most. It suits cells of 1.5 wrap, or smaller ones.
-    inside : three numbers, optional
-        A point: with `wrap`, the solid is the space around this point, up to about wrap / 2 from the triangles.
-    bottom : float, optional
-        The triangles are a terrain, and the solid is the ground below them, down to this height z, repaired. Its walls
-        and its bottom are the boundaries ``side`` and ``bottom``. The air above is ``Solid.outside(ground, box)``.
+    **preparation
+        What is done to the triangles before, in this order:
+
+        - `join` float: vertices within this distance count as one.
+        - `bottom` float: the triangles are a terrain, and the solid is the ground below them, down to this height z,
+          repaired. Its walls and its bottom are the boundaries ``side`` and ``bottom``. The air above is
+          ``Solid.outside(ground, box)``.
+        - `repair` bool: join vertices across small gaps, remove duplicate triangles, close flat holes, orient
+          triangles and unite parts that cross or touch, with a warning that says what was done. Closed holes are
+          boundaries with the names ``hole-1``, ... Other holes, and parts that cross themselves, stay errors.
+        - `wrap` float: take a closed surface around all triangles in their place, whatever is wrong with them. It is
+          about wrap / 2 outside of them, and closes holes and gaps up to 2 wrap wide; sheets become plates as thick as
+          `wrap`. What is finer is left out, with sharp edges. Groups that `names` mentions stay, all others become one:
+          ``wall``. A warning says how far the surface is from the triangles at most. It suits cells of 1.5 wrap, or
+          smaller ones.
+        - `inside` three numbers: with `wrap`, the solid is the space around this point, up to about wrap / 2 from the
+          triangles.
 
     Attributes
     ----------
