@@ -131,9 +131,10 @@ def warn_of_errors(result: Result) -> None:
             "period away"
         )
     elif steep:
+        scaled = f"{result.size_factor:.3g} * size" if abs(math.log(result.size_factor)) > math.log(STEEP) else "size"
         why = (
             "sizes change there by more than cells can follow from one to the next: bound their growth, as by "
-            "sizing.Graded(size, growth=1.2), or use more cells"
+            f"sizing.Graded({scaled}, growth=1.2), or use more cells"
         )
     else:
         why = diagram.domain.why_sizes_are_missed(result.points[worst], wanted, len(diagram))
