@@ -18,9 +18,10 @@
 #define FREE_SHARE R(0.999)
 
 /* A patch may be bent around a generator if `shift` is more than this share of the depth. It is if it is opposite, too,
-   within OPPOSITE of the reach. Planes are moved inwards by AREA_SHARE of their depth then, so that they enclose the
-   area of a circle. */
-#define BENT R(0.1)
+   within OPPOSITE of the reach. Planes are moved inwards by at most AREA_SHARE of their depth then, so that they
+   enclose the area of a circle. The first share is less than the last: a cell that has further planes keeps them, and
+   its volume, while its generator moves a little. */
+#define BENT R(0.05)
 #define OPPOSITE R(0.75)
 #define AREA_SHARE R(0.1)
 #define AROUND 5
@@ -69,9 +70,11 @@ inline bool meets_patch(REAL4 x, REAL4 way, int patch, REAL4 *plane, WALL_ARGS, 
     const foot_t foot = foot_on_triangle(wall_corners[3 * hit] - there, wall_corners[3 * hit + 1] - there,
                                          wall_corners[3 * hit + 2] - there, wall_kinds[hit].s1);
     REAL4 at;
-    *plane = direction_of(blend_at(hit, foot.s, foot.t, x, &at, wall_corners, wall_normals));
-    plane->s3 = dot(*plane, at);
-    return plane->s3 > 0;
+    const REAL4 blend = blend_at(hit, foot.s, foot.t, x, &at, wall_corners, wall_normals);
+    *plane = direction_of(blend);
+    const REAL depth = dot(*plane, at);
+    plane->s3 = fmax(depth - fmin(blend.s3, AREA_SHARE * depth), LEAST_DEPTH);
+    return depth > 0;
 }
 
 /* Direction k from a generator with a wall in the direction of `normal`: first away from it. */
@@ -145,14 +148,13 @@ kernel void find_own_planes(const int size, global const REAL *points, WALL_ARGS
         const bool bent = blend.s3 > BENT * depth && meets_patch(x, OPPOSITE * reach * direction_around(0, normal),
                                                                  patch, &plane, WALL, wall_normals);
         const REAL4 direction = normal;
-        normal.s3 = fmax(bent ? (1 - AREA_SHARE) * depth : fmax(depth - blend.s3, depth / 2), LEAST_DEPTH);
+        normal.s3 = fmax(depth - fmin(blend.s3, (bent ? AREA_SHARE : R(0.5)) * depth), LEAST_DEPTH);
         planes[count] = normal;
         labels[count] = -1 - patch;
         ++count;
         for (int k = 0; bent && k < AROUND; ++k)
             if (count + n - m <= MOST_OWN &&
                 meets_patch(x, reach * direction_around(k, direction), patch, &plane, WALL, wall_normals)) {
-                plane.s3 = fmax((1 - AREA_SHARE) * plane.s3, LEAST_DEPTH);
                 planes[count] = plane;
                 labels[count++] = -1 - patch;
             }

@@ -1,4 +1,4 @@
-/* The planes of walls that cut the cell of one generator, and no other cell: in a solid (macro SOLID).
+/* The planes of walls that cut the cell of one generator, and no other cell: where cells have walls of their own.
 
    own_rows[i]    place of the first of its planes, and their number
    own_labels     -1 - patch
@@ -9,7 +9,7 @@
    CLIP_BOX_ARGS: what cells start from. The box lies around the solid, so that it never bounds a finished cell. */
 #include "opencl/real.h"
 
-#ifdef SOLID
+#ifdef OWN_WALLS
 #define OWN_ARGS                                                                                                       \
     , global const int2 *own_rows, global const int *own_labels, global const REAL4 *own_planes,                       \
         global const float *own_found, global float *own_reach

@@ -784,7 +784,7 @@ class Domain(ClipBox):
     def traits(self, real: np.dtype) -> Traits:
         """Return for what kernels are built, with the periods in the device's coordinates."""
         if self.wall_triangles is not None:
-            return Traits(("SOLID",))
+            return Traits(("SOLID", "OWN_WALLS"))
         if not any(self.periodic):
             return PLAIN
         x, y, z = [float(period) for period in self.periods(real)] + [0.0] * (3 - self.dim)
