@@ -89,7 +89,7 @@ class Adapter:
         Called by a first run with the number of kernels that are built, and of those that it needs. Without it such a
         run shows a line on the terminal, if the standard error is one.
     on_work : callable, optional
-        Called with the name of each part of the work after the last step: that at the walls of a solid.
+        Called with each part of the work after the last step, at the walls of a solid, and how far it is.
 
     Raises
     ------

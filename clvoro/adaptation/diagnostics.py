@@ -38,7 +38,7 @@ MAX_SPACING = 1 / 16
 
 
 def warn_of_narrow_parts(domain: Domain, size: Callable[[np.ndarray], np.ndarray]) -> None:
-    """Warn if cells of the target size do not fit between the walls of `domain` somewhere, or into a dead end.
+    """Warn if cells of the target size do not fit between walls of `domain`, in many places, or into a dead end.
 
     - `size`: takes points (n, d) and returns target sizes (n,).
 
@@ -51,6 +51,11 @@ def warn_of_narrow_parts(domain: Domain, size: Callable[[np.ndarray], np.ndarray
     here = f"{found.width:.3g} wide at {format_point(found.place)}, where the size field is {found.size:.3g}; "
     if strait is not None:
         text = f"the domain is narrower than half a cell: {here}cells there are long and reach from wall to wall"
+    elif found.share:
+        text = (
+            f"{found.share:.0%} of the walls are nearer than a cell to one that faces them: the domain is {here}such "
+            "meshes take longer, and OpenFOAM may not accept cells there"
+        )
     else:
         text = f"the domain has a dead end that is narrower than a cell: {here}cells there have poor shapes"
     warn(f"{text}. {domain.remedy_for_narrow_parts}", MismatchWarning)
@@ -96,8 +101,8 @@ def warn_of_other_sizes(result: Result) -> None:
     )
 
 
-def warn_of_errors(result: Result) -> None:
-    """Warn if a converged mesh does not have the sizes of its field, and name the worst cell.
+def warn_of_errors(result: Result, size: Callable[[np.ndarray], np.ndarray]) -> None:
+    """Warn if a converged mesh does not have the sizes of its field `size`, and name the worst cell.
 
     Warns with `SizeErrorWarning`.
     """
@@ -116,8 +121,11 @@ def warn_of_errors(result: Result) -> None:
         return  # `CoarseSizeWarning` says it before the run
     place = diagram.domain.place_name(result.points[worst])
     near = [worst, *_ring(diagram, worst)]
-    pairs = ((i, j) for i in near for j in _ring(diagram, i) if amounts[i] and amounts[j])  # not of sizes of their own
-    steep = any(abs(math.log(sizes[j] / sizes[i])) > math.log(STEEP) for i, j in pairs)
+    pairs = np.array([(i, j) for i in near for j in [i, *_ring(diagram, i)]])
+    # Not `target_size`: cells at creases have sizes of their own.
+    rows, place_of = np.unique(pairs, return_inverse=True)
+    first, second = np.log(size(diagram.points[rows]))[place_of.reshape(-1, 2)].T
+    steep = bool(np.abs(first - second).max() > math.log(STEEP))
     if diagram.layer.any():
         why = (
             "cells beside layers of prisms make room for them, and are too large where these are thinner than given: "

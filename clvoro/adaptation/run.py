@@ -495,14 +495,14 @@ class Run:
             elif len(wild := last["step"][last["residual"] > 1]):
                 reason = f"plan ended, but step {wild[-1]} did not converge: cells are less regular than usual"
             if reason:
-                warn_of_errors(result)
+                warn_of_errors(result, self.state.sizing)
                 return dataclasses.replace(result, converged=False, stop_reason=reason)
         if result.converged:
             self._note_end_of_trade(result)
             if self.obtuse:
                 warn_of_obtuse_triangles(result)
             if self._options.multilevel:
-                warn_of_errors(result)
+                warn_of_errors(result, self.state.sizing)
         return result
 
     def _read_result(self) -> Result:

@@ -663,18 +663,13 @@ class Domain(ClipBox):
         """
         return np.empty(0), np.empty((0, self.dim))
 
-    def narrowest(self, size: Callable[[np.ndarray], np.ndarray]) -> tuple[np.ndarray, float]:
-        """Return a place (d,) where the domain is narrowest in units of the sizes `size`, and its width there."""
-        del size
-        widths = np.where(self.periodic, np.inf, self.extent)
-        return (np.array(self.lower) + self.upper) / 2, float(widths.min())
-
     def narrow_parts(self, size: Callable[[np.ndarray], np.ndarray]) -> tuple[NarrowPart | None, NarrowPart | None]:
         """Return where the domain is narrower than half a cell of `size`, and a dead end narrower than a cell, or None.
 
         By default there are no dead ends.
         """
-        place, width = self.narrowest(size)
+        place = np.add(self.lower, self.upper) / 2
+        width = float(np.where(self.periodic, np.inf, self.extent).min())
         strait = NarrowPart(place, width, float(size(place[None])[0]))
         return strait if strait.width < NARROW * strait.size else None, None
 

@@ -71,11 +71,15 @@ def find_gaps(domain: Polygon, least: float, most: float) -> tuple[np.ndarray, n
 
 @dataclass(frozen=True)
 class NarrowPart:
-    """A part of a domain that is narrow for its cells: a place (2,), the width and the target size there."""
+    """A part of a domain that is narrow for its cells: a place (d,), the width and the target size there.
+
+    - `share`: that of all walls which are nearer to each other than a cell, where this is known.
+    """
 
     place: np.ndarray
     width: float
     size: float
+    share: float = 0.0
 
 
 def find_narrow_parts(

@@ -26,6 +26,7 @@ _OPTIONS: dict[str, dict[str, Any]] = {
     "obj": {"skip_materials": True, "split_groups": True, "split_objects": True, "group_material": False}
 }
 _TURNS = 32  # triangles around a circle of a STEP file
+_MOST_POINTS = 200_000  # on the edges of a STEP file: with more, faces would take Gmsh many minutes
 _UNITS = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "km": 1e3, "um": 1e-6, "in": 0.0254, "ft": 0.3048}
 _UNNAMED = "Open CASCADE STEP translator"  # so begin the names that Open CASCADE gives shapes without one
 
@@ -179,6 +180,8 @@ def _read_step(path: Path) -> list[FilePart]:
         if others:  # parts that touch or overlap get common faces
             gmsh.model.occ.fragment([first], others)
         gmsh.model.occ.synchronize()
+        gmsh.model.mesh.generate(1)
+        _refuse_too_fine(path, len(gmsh.model.mesh.getNodes()[0]))
         gmsh.model.mesh.generate(2)
         tags, points = (np.asarray(part) for part in gmsh.model.mesh.getNodes()[:2])
         place = np.zeros(int(tags.max()) + 1 if len(tags) else 1, np.int64)
@@ -190,6 +193,8 @@ def _read_step(path: Path) -> list[FilePart]:
                 nodes = np.asarray(gmsh.model.mesh.getElementsByType(2, face)[1])
                 triangles = place[nodes.astype(np.int64)].reshape(-1, 3)
                 found.setdefault("" if name.startswith(_UNNAMED) else name, []).append(triangles)
+    except InputError:
+        raise
     except Exception as error:  # Gmsh raises plain exceptions
         raise InputError(f"{str(path)!r} cannot be read as STEP ({error}); export it again, or as STL") from error
     finally:
@@ -201,3 +206,13 @@ def _read_step(path: Path) -> list[FilePart]:
         raise InputError(f"{str(path)!r} holds no solid, expected one; surfaces alone bound no region")
     vertices = np.asarray(points, float).reshape(-1, 3)
     return [FilePart(name, vertices, np.concatenate(triangles)) for name, triangles in found.items()]
+
+
+def _refuse_too_fine(path: Path, points: int) -> None:
+    """Raise `InputError` if there are too many `points` on the edges of a STEP file."""
+    if points > _MOST_POINTS:
+        raise InputError(
+            f"{str(path)!r} has long edges on surfaces of tiny radii: by {_TURNS} triangles around each they have "
+            f"{points} points, expected at most {_MOST_POINTS}, as Gmsh would need hours; export it as STL with a "
+            "tolerance of a tenth of the cells, and read that"
+        )

@@ -289,19 +289,17 @@ def test_warnings_of_coarse_sizes(ctx, size, n_cells, category, advice):
         assert w.filename == __file__
 
 
-@pytest.mark.parametrize(("error", "advice"), [(0.0, "do not fill evenly"), (0.1, "sizing.Graded")])
-def test_sizes_of_their_own_are_not_steep(error, advice):
-    """Cells at creases have sizes of their own, and no error."""
+@pytest.mark.parametrize(("growth", "advice"), [(0.0, "do not fill evenly"), (9.0, "sizing.Graded")])
+def test_sizes_of_their_own_are_not_steep(growth, advice):
+    """Cells at creases have sizes of their own: the field tells whether sizes grow."""
     diagram = clvoro.voronoi(clvoro.Box((0, 0), (1, 1)), np.random.default_rng(4).random((30, 2)))
     sizes, errors = np.full(30, 0.2), np.full(30, 0.01)
     worst = 3
     errors[worst] = 9.0
-    row = diagram.neighbors[diagram.neighbor_starts[worst] : diagram.neighbor_starts[worst + 1]]
-    beside = int(row.max())
-    sizes[beside], errors[beside] = 0.05, error
+    sizes[int(diagram.neighbors[slice(*diagram.neighbor_starts[worst : worst + 2])].max())] = 0.05
     result = SimpleNamespace(diagram=diagram, target_size=sizes, size_error=errors, points=diagram.points, settings={})
     with pytest.warns(SizeErrorWarning, match=advice):
-        warn_of_errors(result)
+        warn_of_errors(result, lambda x: 0.2 + growth * x[:, 0])
 
 
 def test_size_errors_in_polygons_have_a_remedy():

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import numpy as np
 
@@ -84,6 +84,7 @@ class Cures:
     - `searches`: how often cures have been tried on a cell, also by the earlier cures.
     - `most`: the number of searches after which no cure is tried.
     - `branches`: after how many of the cures of a cell others are tried.
+    - `tell`: called with the work and how far it is.
     """
 
     def __init__(
@@ -98,6 +99,7 @@ class Cures:
         self.surface, self.edits, self.names, self.sizes = surface, Edits(faces), names, sizes
         self.changes, self.searches, self.changed, self.tried = 0, 0, dict[int, int](), dict[int, tuple[int, int]]()
         self.most, self.branches, self.strictly = _MOST, _BRANCHES, strictly
+        self.tell: Callable[[str], object] = lambda _: None
         self.excess: dict[int, tuple[int, float]] = {}
         self.judged: dict[tuple[Edits, int, bool], list[Option]] = {}
         self.concave: dict[tuple[Edits, int], list[tuple[float, Edge, int, int, np.ndarray]]] = {}
@@ -150,12 +152,13 @@ class Cures:
     def work_on(self, cells: list[int]) -> None:
         """Cure these cells, and those that cures change, until no cure helps any more."""
         self.most = min(self.most, self.searches + _EACH * len(cells))
-        todo, again = cells, True
+        todo, again, work = cells, True, "oblique faces" if self.strictly else "cells that are rejected at walls"
         while again:
             again = False
             todo = self.edits.alive(todo)
             self.measure(todo)
-            for cell in todo:
+            for number, cell in enumerate(todo):
+                self.tell(f"{work}: {number} of {len(todo)}")
                 for _ in range(_BUDGET):
                     if not self.cure(cell):
                         break
@@ -575,17 +578,19 @@ def cured(
     rejected: np.ndarray,
     earlier: Cures | None = None,
     oblique: np.ndarray | None = None,
+    tell: Callable[[str], object] = lambda _: None,
 ) -> tuple[Faces, np.ndarray, np.ndarray, np.ndarray, Cures | None]:
     """Cure the `rejected` cells (k,) of a mesh where that works. If `oblique` cells (k,) are given, mend their faces.
 
     The mesh stays as it is if cures would leave more cells rejected. `earlier` cures are those of an earlier mesh of
     the solid; see `Cures`. Return the mesh; which of the given cells each of its cells was; `own` and the cells that
-    are still rejected, as in `_Made`; and the cures.
+    are still rejected, as in `_Made`; and the cures. `tell` is called with the work and how far it is.
     """
     if len(rejected) > _TOO_MANY * faces.n_cells:
         return faces, np.arange(faces.n_cells), own, rejected, None
     begun = (rejected if oblique is None else oblique).tolist()
     cures = Cures(surface, faces, names, sizes, earlier, oblique is not None)
+    cures.tell = tell
     if oblique is not None:
         cures.most = cures.searches + _OBLIQUE + len(begun)
     for branches in (_BRANCHES,) if oblique is None else (_BRANCHES, _MORE_BRANCHES):

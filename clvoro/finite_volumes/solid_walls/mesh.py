@@ -315,7 +315,7 @@ class _Trials:
             return made
         names, h = near.numbers[made.home], near.sizes[made.home]
         faces, origin, own, rejected, self._turned = cured(
-            self.surface, made.faces, names, made.own, h, made.rejected, self._turned, oblique
+            self.surface, made.faces, names, made.own, h, made.rejected, self._turned, oblique, self.tell
         )
         return replace(made, faces=faces, home=made.home[origin], own=own, rejected=rejected)
 
@@ -426,9 +426,8 @@ def _finished(
         faces, changed = _collapsed(faces, near.sizes[home], with_neighbors(faces, suspect))
         rejected = rejected_at_walls(faces, with_neighbors(faces, changed | suspect))
     if len(rejected) and not (spares and _are_many(near, rejected)):
-        tell("cells that are rejected at walls")
         names, h = near.numbers[home], near.sizes[home]
-        faces, origin, own, rejected, cures = cured(surface, faces, names, own, h, rejected, earlier)
+        faces, origin, own, rejected, cures = cured(surface, faces, names, own, h, rejected, earlier, None, tell)
         home = home[origin]
     if not own.all():
         centroids = faces.measures.geometry.centroids

@@ -20,6 +20,7 @@ from ..boundary_names import BoundaryNames, Walls
 from ..box import Box
 from ..columns import Columns
 from ..domain import Domain
+from ..gaps import NARROW, NarrowPart
 from ..nearest_triangles import Feet, NearestTriangles, heights_over
 from ..polygon import Polygon
 from ..shapes import Edges
@@ -49,6 +50,7 @@ if TYPE_CHECKING:
 
 _ON = 1e-12  # of the diagonal: points this close to the surface lie on it
 _PROBES = 4096  # places on the surface from which widths are measured
+_MANY_THIN = 0.1  # share of the surface: if more of it is nearer to a facing wall than a cell, a run says so before it
 _FACING = -0.7  # product of the normals of two walls that face each other
 _WRAPPED = 150.0  # degrees: a wrap has no creases
 _MARGIN = 0.05  # of the longest edge, by which the clip box is larger than the region
@@ -510,23 +512,25 @@ class Solid(Domain):
 
         return uncovered(self, *walls(), smallest)
 
-    def narrowest(self, size: Callable[[np.ndarray], np.ndarray]) -> tuple[np.ndarray, float]:
-        """Return a place (3,) where the solid is narrowest in units of the sizes `size`, and its width there.
+    def narrow_parts(self, size: Callable[[np.ndarray], np.ndarray]) -> tuple[NarrowPart | None, NarrowPart | None]:
+        """Return where the solid is narrower than half a cell, or where it is narrowest if many walls are that near.
 
         The width is that of thin parts and of gaps between bodies, measured inwards from a sample of the surface. Sharp
         edges, where two walls meet, do not count.
         """
         areas = np.cumsum(self._areas)
         k = np.arange(_PROBES)
-        item = np.minimum(np.searchsorted(areas, (k + 0.5) / _PROBES * areas[-1]), len(areas) - 1)
-        item = np.unique(np.concatenate([item, k * len(areas) // _PROBES]))
+        even = np.minimum(np.searchsorted(areas, (k + 0.5) / _PROBES * areas[-1]), len(areas) - 1)
+        item = np.unique(np.concatenate([even, k * len(areas) // _PROBES]))
         begin = self.surface.corners[item].mean(axis=1)
         h = np.asarray(size(begin), float)
-        width = np.minimum(self.widths(item, h), max(float(self.extent.min()), 0.0))
+        width = self.widths(item, h)
+        share = float((width < h)[np.searchsorted(item, even)].mean())
+        width = np.minimum(width, float(self.extent.min()))
         worst = int((width / h).argmin())
-        if not width[worst] < h[worst]:
-            return np.add(self.lower, self.upper) / 2, float(self.extent.min())
-        return begin[worst] - 0.5 * width[worst] * self.normals[item[worst]], float(width[worst])
+        place = begin[worst] - 0.5 * width[worst] * self.normals[item[worst]]
+        part = NarrowPart(place, float(width[worst]), float(h[worst]), share)
+        return part if part.width < NARROW * part.size else None, part if share > _MANY_THIN else None
 
     def widths(self, items: np.ndarray, reach: np.ndarray) -> np.ndarray:
         """Return how far the wall is that faces each of the triangles `items` (k,), up to `reach` (k,); else inf.

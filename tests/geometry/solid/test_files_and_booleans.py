@@ -5,6 +5,7 @@ import pytest
 
 from clvoro import Box, Solid
 from clvoro.errors import ClvoroError, InputError, MismatchWarning
+from clvoro.geometry import surface_files
 from clvoro.geometry.solid import wrapping
 
 CUBE = Solid.box((0, 0, 0), (1, 1, 1))
@@ -44,7 +45,7 @@ def test_every_format_brings_the_same_solid(tmp_path, kind):
     assert Solid.from_trimesh(mesh).measure == pytest.approx(ball.measure)
 
 
-def test_a_step_file_is_read_in_meters_and_its_parts_are_united(tmp_path):
+def test_a_step_file_is_read_and_its_parts_are_united(tmp_path, monkeypatch):
     gmsh = pytest.importorskip("gmsh")
     gmsh.initialize(interruptible=False)
     try:
@@ -59,6 +60,9 @@ def test_a_step_file_is_read_in_meters_and_its_parts_are_united(tmp_path):
     solid = Solid.read(tmp_path / "part.step")
     assert solid.measure == pytest.approx(np.pi * 0.005**2 * 0.02 + 0.004**2 * 0.01, rel=0.02)
     assert (solid.n_patches, solid.n_pieces) == (3 + 5, 1)
+    monkeypatch.setattr(surface_files, "_MOST_POINTS", 99)
+    with pytest.raises(InputError, match=r"expected at most 99, .* export it as STL"):
+        Solid.read(tmp_path / "part.step")
 
 
 def test_the_outside_of_a_body_has_the_names_of_both():

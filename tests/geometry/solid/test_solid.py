@@ -143,16 +143,19 @@ def test_a_solid_comes_back_from_its_description():
 
 
 def test_thin_parts_and_gaps_are_found():
+    def size(x):
+        return np.full(len(x), 0.2)
+
     plate = Solid.box((0, 0, 0), (1, 1, 0.02))
-    place, width = plate.narrowest(lambda x: np.full(len(x), 0.2))
-    assert width == pytest.approx(0.02)
-    assert plate.contains(place[None])[0]
     gap = Solid.outside(Solid.box((0, 0, 0.03), (1, 1, 0.5)), ((-1, -1, 0), (2, 2, 1)))
-    place, width = gap.narrowest(lambda x: np.full(len(x), 0.2))
-    assert width == pytest.approx(0.03)
-    assert gap.contains(place[None])[0]
+    for solid, width in ((plate, 0.02), (gap, 0.03)):
+        strait = solid.narrow_parts(size)[0]
+        assert strait.width == pytest.approx(width)
+        assert solid.contains(strait.place[None])[0]
+    strait, thin = Solid.box((0, 0, 0), (1, 1, 0.15)).narrow_parts(size)
+    assert (strait, thin.share) == (None, pytest.approx(2 / 2.6, rel=0.01))
     for solid in (SOLIDS["box"], SOLIDS["ball"], Solid.cone((0, 0, 0), (0, 0, 1), 0.2)):
-        assert solid.narrowest(lambda x: np.full(len(x), 0.1))[1] > 0.1
+        assert solid.narrow_parts(lambda x: np.full(len(x), 0.1)) == (None, None)
 
 
 @pytest.mark.parametrize(
