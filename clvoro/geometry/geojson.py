@@ -168,7 +168,7 @@ def pieces_of_description(values: Mapping[str, Any]) -> list[list[np.ndarray]]:
 
 def may_be_degrees(lower: Sequence[float], upper: Sequence[float]) -> bool:
     """Return whether a bounding box can be one of longitudes and latitudes."""
-    return min(lower[0], -upper[0]) >= -180 and min(lower[1], -upper[1]) >= -90
+    return -180 <= lower[0] and upper[0] <= 360 and -90 <= lower[1] and upper[1] <= 90
 
 
 def _warn_of_degrees(node: Any, pieces: list[list[object]], name: str) -> None:

@@ -193,16 +193,19 @@ def test_runs_warn(ctx):
         adapter.run(BOX, 0.1, layers=clvoro.Layers(0.05, edges=[2]), **options)
 
 
-def lake(latitude, crs):
-    ring = [[8.0, latitude], [8.2, latitude], [8.2, latitude + 0.1], [8.0, latitude]]
+def lake(latitude, crs, east=8.0):
+    ring = [[east, latitude], [east + 0.2, latitude], [east + 0.2, latitude + 0.1], [east, latitude]]
     named = {} if crs is None else {"crs": {"type": "name", "properties": {"name": crs}}}
     return {"type": "Polygon", "coordinates": [ring], **named}
 
 
-@pytest.mark.parametrize("crs", ["urn:ogc:def:crs:OGC:1.3:CRS84", "EPSG:4326", "urn:ogc:def:crs:EPSG::4326", None])
-def test_longitudes_and_latitudes(tmp_path, crs):
+@pytest.mark.parametrize(
+    ("crs", "east"),
+    [("urn:ogc:def:crs:OGC:1.3:CRS84", 8), ("EPSG:4326", 8), ("urn:ogc:def:crs:EPSG::4326", 8), (None, 8), (None, 238)],
+)
+def test_longitudes_and_latitudes(tmp_path, crs, east):
     path = tmp_path / "lake.geojson"
-    path.write_text(json.dumps(lake(46.2, crs)))
+    path.write_text(json.dumps(lake(46.2, crs, east)))
     what = "coordinates like degrees" if crs is None else "longitudes and latitudes"
     with pytest.warns(MismatchWarning, match=rf"lake\.geojson has {what}.* 0\.69 times"):
         clvoro.Polygon.from_geojson(path)
