@@ -1027,7 +1027,7 @@ TESTED_IN = {
     "file, expected GeoJSON": "adaptation/test_messages.py::test_shapefiles",
     "is a geometry, expected a case": "cli/test_cli.py::test_errors_are_one_message",
     "which is too small for its extent": "geometry/solid/test_files_and_booleans.py::test_wrong_options_are_refused",
-    "Gmsh would need hours": "geometry/solid/test_files_and_booleans.py::test_a_step_file_is_read_and_its_parts_are_united",
+    "Gmsh would need hours": "geometry/solid/test_files_and_booleans.py::test_parts_of_step_files_are_united",
     "longer than the surface": "geometry/solid/test_files_and_booleans.py::test_wrong_options_are_refused",
     "is drawn in a figure of its own": "geometry/test_boundary_names.py::test_plots_show_walls_in_space",
     "that of a mesh is mesh.domain": "geometry/test_boundary_names.py::test_plots_show_the_names",

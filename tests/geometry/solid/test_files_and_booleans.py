@@ -45,7 +45,7 @@ def test_every_format_brings_the_same_solid(tmp_path, kind):
     assert Solid.from_trimesh(mesh).measure == pytest.approx(ball.measure)
 
 
-def test_a_step_file_is_read_and_its_parts_are_united(tmp_path, monkeypatch):
+def test_parts_of_step_files_are_united(tmp_path, monkeypatch):
     gmsh = pytest.importorskip("gmsh")
     gmsh.initialize(interruptible=False)
     try:
