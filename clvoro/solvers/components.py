@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pyopencl.array as cla
-import scipy
 
-from ..connectivity import components
+from ..connectivity import components, rows_of
 from ..geometry.domain import Domain
 from ..opencl.engine import Engine
 from ..tessellation.device_diagram import Tessellation
@@ -92,6 +91,5 @@ def connected_components(starts: np.ndarray, neighbors: np.ndarray) -> np.ndarra
       be longer.
     """
     n, other = len(starts) - 1, neighbors[: starts[-1]]
-    other = np.where((other < 0) | (other >= n), np.repeat(np.arange(n, dtype=other.dtype), np.diff(starts)), other)
-    graph = scipy.sparse.csr_array((np.ones(len(other), np.int8), other, starts), shape=(n, n))
-    return scipy.sparse.csgraph.connected_components(graph, directed=False)[1]
+    own = (other >= 0) & (other < n)
+    return components(n, rows_of(starts)[own], other[own])[1]

@@ -184,7 +184,8 @@ def _files(node: Any) -> Iterator[tuple[Any, Any]]:
 def _check_walls(table: dict[str, Any], domain: Domain, place: str) -> None:
     """Check all walls that a case names, and the types of patches."""
     for key, node in _tables({key: table[key] for key in ("size", "layers") if key in table}, place):
-        if node.get("edges") is not None and (key.startswith(f"{place} layers") or node.get("kind") == "boundary"):
+        of_walls = key.startswith(f"{place} layers") or node.get("kind") in ("boundary", "creases")
+        if of_walls and node.get("edges") is not None:
             domain.boundaries.select(f"{key}.edges", node["edges"])
     for name in table.get("patches", {}):
         domain.boundaries.select(f"{place} patches", name)

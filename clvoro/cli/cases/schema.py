@@ -158,6 +158,16 @@ class BoundaryShape(Kind, tag="boundary"):
         return domain if self.edges is None else shape
 
 
+class CreasesShape(Kind, tag="creases"):
+    edges: Walls | None = None
+    concave: bool | None = None
+
+    def build(self, folder: Path, domain: Any = None) -> Any:
+        if not isinstance(domain, Solid):
+            raise InputError(f"size.shapes has creases, expected a solid as the domain in place of {domain}")
+        return domain.crease_edges(self.edges, concave=self.concave)
+
+
 class SurfaceShape(Kind, tag="surface"):
     file: Text
     closed: bool = False
@@ -193,6 +203,7 @@ Shape = (
     | BallShape
     | BoxShape
     | BoundaryShape
+    | CreasesShape
     | SurfaceShape
     | SegmentShape
     | PolylineShape

@@ -46,6 +46,15 @@ def test_a_case_names_several_files_and_takes_them_along(tmp_path):
         Case.from_toml(text.replace("xMin.stl.gz", "apart.stl"), "case.toml", tmp_path)
 
 
+def test_creases_are_shapes_of_sizes():
+    sizes = '[size]\nkind = "distance"\nh_min = 0.1\ngrowth = 1.2\nshapes = [{ kind = "creases", edges = "xMin" }]\n'
+    around = "outside = { lower = [-1, -1, -0.75], upper = [2, 1, 0.75] }"
+    case = Case.from_toml(TABLE.format(more=around).partition("[size]")[0] + sizes, "case.toml")
+    assert case.size_field()([[-1, -1, 0], [-1, 0, 0.75], [2, 0, 0]]) == pytest.approx([0.1, 0.1, 0.664], abs=1e-3)
+    with pytest.raises(InputError, match="expected a solid"):
+        Case.from_toml("[domain]\nlower = [0, 0]\nupper = [1, 1]\n" + sizes, "case.toml").size_field()
+
+
 def test_wrong_keys_of_a_solid_are_refused():
     with pytest.raises(InputError, match="unknown key 'unit'"):
         Case.from_toml(TABLE.format(more='unit = "mm"'), "case.toml")
