@@ -172,7 +172,8 @@ def _read_step(path: Path) -> list[FilePart]:
         gmsh.initialize(interruptible=False)
     try:
         gmsh.option.setNumber("General.Terminal", 0)
-        gmsh.option.setString("Geometry.OCCTargetUnit", "M")
+        # That of Open CASCADE: another one would stay in this process, for files that the caller writes.
+        gmsh.option.setString("Geometry.OCCTargetUnit", "MM")
         gmsh.option.setNumber("Mesh.MeshSizeFromCurvature", _TURNS)
         gmsh.model.add("part")
         gmsh.model.occ.importShapes(os.fspath(path))
@@ -204,7 +205,7 @@ def _read_step(path: Path) -> list[FilePart]:
             gmsh.model.remove()
     if not found:
         raise InputError(f"{str(path)!r} holds no solid, expected one; surfaces alone bound no region")
-    vertices = np.asarray(points, float).reshape(-1, 3)
+    vertices = _UNITS["mm"] * np.asarray(points, float).reshape(-1, 3)
     return [FilePart(name, vertices, np.concatenate(triangles)) for name, triangles in found.items()]
 
 
