@@ -42,6 +42,8 @@ _IN_CUT = 0.7
 """Brightness of faces in the cut, over that of faces on walls and sides of the box."""
 _IN_BOX, _NAMES = 0.5, 10
 """Least share of the sides of its bounding box that are walls of a space in a box; names of boundaries in a picture."""
+_FEW_ACROSS = 1.8
+"""Cells across a domain below which a removed octant has all of them: those left would stand alone."""
 
 
 def plot_slice(
@@ -163,7 +165,7 @@ def plot_slices(
             plot_slice(result, color, ax, normal=normal, through=point, limits=paint.limits, key=False)
             ax.locator_params(nbins=5)
         if len(normals) < len(axes):
-            _draw_cutaway(axes[-1], diagram, paint, "octant", point, VIEW)
+            _draw_cutaway(axes[-1], diagram, paint, "octant", _corner(result, through, VIEW), VIEW)
         if title is not None:
             figure.suptitle(title, fontsize=10)
         add_key(axes, paint, below=True)
@@ -200,7 +202,7 @@ def plot_cutaway(
         marked as kept; or nothing. Faces in the cut are darker than those on walls and sides of the box. The walls
         of a body are shown where cells are removed around it, with a color for each boundary.
     through : 3 floats, optional
-        The point; by default among the smallest cells.
+        The point; by default among the smallest cells, or behind all that are in a thin plate.
     angles : (azimuth, elevation), degrees
         Direction of the viewer.
     walls : bool
@@ -225,7 +227,7 @@ def plot_cutaway(
     with styled():
         if ax is None:
             ax = interactive_figure(WIDTH, cutaway_height(result, angles)).add_subplot()
-        _draw_cutaway(ax, result.diagram, paint, cut, _point(result, through), angles, edges, walls)
+        _draw_cutaway(ax, result.diagram, paint, cut, _corner(result, through, angles), angles, edges, walls)
         _label_axes(ax, result.diagram, *view_axes(angles))
         return finished(ax, paint, key, title)
 
@@ -577,6 +579,15 @@ def _point(result: Result, through: ArrayLike | None) -> np.ndarray:
     if point.shape != (3,):
         raise InputError(f"through has shape {point.shape}, expected 3 coordinates")
     return point
+
+
+def _corner(result: Result, through: ArrayLike | None, angles: tuple[float, float]) -> np.ndarray:
+    """Return the corner of a removed octant: where cells are few across the domain, behind all of them."""
+    point, domain = _point(result, through), result.diagram.domain
+    if through is not None:
+        return point
+    behind = np.where(view_axes(angles)[2] >= 0, domain.lower, domain.upper)
+    return np.where(domain.extent < _FEW_ACROSS * np.cbrt(np.median(result.diagram.volumes)), behind, point)
 
 
 def _cut(cut: Any, n: int, towards: np.ndarray) -> Any:

@@ -305,6 +305,17 @@ def test_faces_in_a_cut_are_darker(ctx, periodic):
     assert brightest[1] < 0.8 * brightest[0]
 
 
+def test_an_octant_of_a_thin_plate_has_cells_on_both_sides_of_its_middle(ctx):
+    i, j = np.divmod(np.arange(64), 8)
+    places = np.column_stack([(i + 0.5) / 8, (j + 0.5) / 8, 0.05 + 0.002 * (-1.0) ** (i + j)])
+    d = Adapter(ctx).diagram(Box((0, 0, 0), (1, 1, 0.1)), places)
+    counts = []
+    for through in (None, (0.5, 0.5, -1), (0.5, 0.5, 0.05)):
+        ax = plot_cutaway(d, np.ones(64), through=through).axes[0]
+        counts += [len(c.get_paths()) for c in ax.collections if isinstance(c, PolyCollection)]
+    assert counts[0] == counts[1] < counts[2]
+
+
 def test_a_body_is_seen_where_cells_around_it_are_removed(ctx):
     body = Solid.box((-0.5, -0.5, -0.5), (0.5, 0.5, 0.5))
     air = Solid.outside(body, ((-2, -2, -2), (2, 2, 2)))
