@@ -124,6 +124,8 @@ def rejection(mesh: Faces, walls: WallShape = "straight") -> str:
     remedy = "Use smaller cells there" if at_walls else "Let a run move the generators, as clvoro.adapt does"
     if mesh.domain.uncut is not mesh.domain:
         remedy = "Use smaller cells there, or let subset keep more or fewer of the cells there"
+    if mesh.layer is not None:
+        remedy = "Use smaller cells there, or layers on fewer boundaries"
     if walls == "exact":
         remedy = "Write it with walls='straight'"
     elif mesh.domain.outline is not None:

@@ -5,6 +5,7 @@ import os
 import re
 import shutil
 import warnings
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -354,6 +355,7 @@ def test_meshes_are_judged_as_by_all_criteria(ctx, name, domain, points):
     for c in failed[:1]:
         assert f"{c.name} is {c.value:.3g}, " in why
         assert format_point(c.place) in why
+        assert "layers on fewer boundaries" in rejection(replace(mesh, layer=np.zeros(mesh.n_cells, np.int16)))
 
 
 @pytest.mark.parametrize("binary", ["no", 2, None])
