@@ -355,7 +355,8 @@ def test_meshes_are_judged_as_by_all_criteria(ctx, name, domain, points):
     for c in failed[:1]:
         assert f"{c.name} is {c.value:.3g}, " in why
         assert format_point(c.place) in why
-        assert "layers on fewer boundaries" in rejection(replace(mesh, layer=np.zeros(mesh.n_cells, np.int16)))
+        if domain.dim == 3 and not any(domain.periodic):  # as solids, which have layers
+            assert "layers on fewer boundaries" in rejection(replace(mesh, layer=np.zeros(mesh.n_cells, np.int16)))
 
 
 @pytest.mark.parametrize("binary", ["no", 2, None])
