@@ -4,10 +4,9 @@
 
      dV_i/dx_j = w_ij (x_j - m_ij),   dV_i/dx_i = sum_j w_ij (m_ij - x_i),   w_ij = l_ij / d_ij,
 
-   with m_ij the centroid of the face, stored relative to x_i. Faces on walls contribute nothing. Where cells have walls
-   of their own, dV_i/dx_i = -sum_j dV_j/dx_i: together the cells fill the domain, wherever the generators are. It gives
-   the operator J = dr/dx of the log ratios r_i = log V_i - d log h(x_i), and B = J h, without units. Conjugate
-   gradients with the diagonal D of the operator as preconditioner solve (B B^T + eps) y = b,
+   with m_ij the centroid of the face, stored relative to x_i. Faces on walls contribute nothing. It gives the operator
+   J = dr/dx of the log ratios r_i = log V_i - d log h(x_i), and B = J h, without units. Conjugate gradients with the
+   diagonal D of the operator as preconditioner solve (B B^T + eps) y = b,
 
      z = D^-1 r    p = z + beta p    s = B^T p = B^T z + beta s    beta = (r, z) / (r, z)_before
      q = B s + eps p    alpha = (r, z) / (p, q)    r -= alpha q    u -= alpha s
@@ -171,10 +170,9 @@ inline void assemble_rows(ITERATION_ARGS, ASSEMBLY_ARGS PERIOD_ARGS, group_t gro
                 least_quality = fmin(least_quality, least_float(CONVERT(float, PICK(REAL, quality, j, 1, 0))));
         }
 #ifdef OWN_WALLS
-        /* The face of the cell across may differ. Its volume changes by that face: else B^T were not the transpose of
-           B, and the iteration could diverge. What the cells across lose, this one gains. */
-        EACH_AXIS (a)
-            self[a] = 0;
+        /* Walls cut each cell by itself, so that the face of the cell across may differ. Derivatives are the means of
+           those by both faces: else B^T were not the transpose of B, and the iteration could diverge. */
+        diagonal = 0;
         for (int k = starts[i]; k < end; ++k) {
             const int j = neighbors[k], back = j < 0 ? -1 : find_entry(i, j, faces - 8, starts, neighbors);
             if (back < 0)
@@ -184,11 +182,16 @@ inline void assemble_rows(ITERATION_ARGS, ASSEMBLY_ARGS PERIOD_ARGS, group_t gro
                 away[a] = x[a] - points[3 * j + a];
                 square += away[a] * away[a];
             }
-            const REAL w = is_fixed ? 0 : face_measures[back] / sqrt(square) * hi;
+            const REAL w = R(0.5) * face_measures[back] / sqrt(square);
+            const REAL here = fixed > 0 && labels[j] < fixed ? 0 : w * h[j] / volumes[i];
+            const REAL there = is_fixed ? 0 : w * hi / volumes[j];
             EACH_AXIS (a) {
-                const REAL lost = w * (away[a] - face_centroids[3 * back + a]);
-                columns[a * room + k] = lost / volumes[j];
-                self[a] -= lost / volumes[i];
+                const int at = a * room + k;
+                const REAL m = face_centroids[3 * back + a], more = -here * m - R(0.5) * rows[at];
+                rows[at] += more;
+                columns[at] = R(0.5) * columns[at] + there * (away[a] - m);
+                change += more * displacement[3 * j + a] / h[j];
+                diagonal += rows[at] * rows[at];
             }
         }
 #endif

@@ -176,7 +176,8 @@ class ProjectedMethod(Method):
     calm_relaxation: float = 1.3
     """Largest factor at thin walls."""
     careful: bool = False
-    """Keep the penalty above `EXACT_PENALTY_PER_ERROR` times what the mean |log(L / h)| is beyond `MET_ERROR`."""
+    """Where walls shape cells, keep the penalty above `EXACT_PENALTY_PER_ERROR` times what the mean |log(L / h)| is
+    beyond `MET_ERROR`: sizes that no mesh has spoil the shapes."""
     steps: int = 0
     """Steps done."""
 
@@ -232,7 +233,7 @@ class ProjectedMethod(Method):
     def _penalty_for(self, mesh: MeshState, w: CellWeights) -> Penalty:
         """Return the penalty for the present errors of the sizes."""
         penalty, scale = self.penalty, self.log_ratio_scale
-        if self.careful:
+        if self.careful and mesh.domain.shapes_cells:
             beyond = mesh.mean_log_ratio_error(w) - tuning.MET_ERROR
             penalty = max(penalty, tuning.EXACT_PENALTY_PER_ERROR * beyond)
         if self.scale_per_error:

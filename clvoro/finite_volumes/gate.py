@@ -100,7 +100,7 @@ def rejection(mesh: Faces, walls: WallShape = "straight") -> str:
 
     All criteria are computed for the cells that walls cut in 3D, and for those that seem bad. Others are convex.
     """
-    at_walls = mesh.domain.cuts_cells or mesh.domain.curved_walls
+    at_walls = mesh.domain.shapes_cells
     if mesh.domain.outline is not None:
         judged = rejected_polygons(mesh)
     else:

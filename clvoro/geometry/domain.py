@@ -223,6 +223,11 @@ class Domain(ClipBox):
         return np.zeros((0, 2), np.int64)
 
     @property
+    def shapes_cells(self) -> bool:
+        """Whether walls may have any shape: they cut cells, or are curved."""
+        return self.cuts_cells or self.curved_walls
+
+    @property
     def plain(self) -> bool:
         """Whether the domain is its bounding box, with walls on all sides."""
         return not (self.curved or self.cuts_cells or any(self.periodic))

@@ -1,5 +1,7 @@
 """One step of each method, against the same formulas in dense NumPy algebra."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -193,6 +195,11 @@ def test_penalty_is_controlled_to_the_error_target(stages):
         largest = max(3.0, PENALTY_PER_ERROR * aim)
         assert method.penalty == pytest.approx(np.clip(0.1 * factor**41, 1e-3, largest))
     assert largest > 3.0, "penalties are larger for loose targets"
+    # Where walls shape cells, exact projections do not force sizes that are far off.
+    for walls, missed, expected in ((False, 0.1, 1e-3), (True, 0.1, 4 * 0.099), (True, 1e-3, 1e-3)):
+        at = SimpleNamespace(cuts_cells=False, shapes_cells=walls)
+        state = SimpleNamespace(domain=at, mean_log_ratio_error=lambda w, e=missed: e)
+        assert ProjectedMethod(penalty=1e-3, careful=True)._penalty_for(state, None).eps == pytest.approx(expected)
     close = ProjectedMethod(penalty=2.9, error_target=0.003)
     close._control_penalty(1e-9)
     assert close.penalty == 3.0

@@ -179,9 +179,10 @@ def test_nothing_leaks_through_a_thin_plate(ctx, real):
 
 
 def test_walls_bent_around_a_generator_cut_its_cell_on_all_sides(ctx):
-    """In a rod as thin as a cell, and in the tip of a cone, planes are a tenth of the depth inside of the walls."""
+    """In a rod as thin as a cell, and in the tip of a cone, planes are a tenth of the depth, about, inside of walls."""
     rod, cone = clvoro.Solid.cylinder((0, 0, 0), (0, 0, 2), 0.2), clvoro.Solid.cone((0, 0, 0), (0, 0, 2), 1)
-    for solid, x, slope in ((rod, (0.01, 0.02, 1.0), 0.0), (cone, (0.01, 0.02, 1.7), 0.5)):
+    cases = (rod, (0.01, 0.02, 1.0), 0.0), (cone, (0.01, 0.02, 1.7), 0.5), (cone, (0.01, 0.02, 1.6), 0.5)
+    for solid, x, slope in cases:
         device = Device(ctx, solid, np.dtype(np.float64), np.array([x]))
         box = SolidBox(device.engine, solid, solid.wall_triangles, lambda y: np.full(len(y), 0.25))
         box.guess(device.sort(), 1)

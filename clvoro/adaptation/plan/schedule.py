@@ -352,6 +352,7 @@ def _finish_3d(effort: Effort, exact: bool, error_target: float, penalty: float)
             iterations=tuning.NEWTON_ITERATIONS_3D,
             gradient_from_field=True,
             correct_mean=True,
+            careful=True,
         )
         *first, last = (replace(newton, tolerance=tolerance) for tolerance in tuning.NEWTON_TOLERANCES_3D)
         yield from [Step(method) for method in first]
