@@ -17,10 +17,11 @@ from ..triangles import NamedTriangles
 from .combining import boolean, library
 from .creases import connect, pair_sides, triangle_normals
 
-_FLAT = 1e-3  # of the extent of a hole: how far it may deviate from a plane
+_FLAT = 1e-3  # of the extent of a hole: how far it may deviate from a plane; of a voxel: from a lattice
 _APART = 1e-6  # of the diagonal: how far from a triangle its two sides are examined
 _LARGEST_GAP = 1e-3  # of the diagonal: gaps that `join` may close
 _SHARPEST = 10.0  # degrees
+_VOXELS = 50, 10  # patches of a surface of voxels at least, and sides of voxels in half of its patches at most
 _NAMED = 3  # pairs of parts with open edges that a message names
 _OR_WRAP = "Or pass wrap=, two thirds of the size of cells, for a closed surface around all triangles"
 
@@ -167,6 +168,27 @@ def volume_inside(corners: np.ndarray) -> float:
     """Return the volume inside of triangles (t, 3, 3), negative if their normals point inwards."""
     a, b, c = np.moveaxis(corners - corners.mean(axis=(0, 1)), 1, 0)
     return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6)
+
+
+def voxel_width(vertices: np.ndarray, normals: np.ndarray, areas: np.ndarray, patch: np.ndarray) -> float | None:
+    """Return the width of the voxels whose surface this is, with a crease at nearly each, or None.
+
+    All triangles are at right angles to an axis, all vertices on a lattice, and most patches are a few of its squares.
+
+    - `normals` (t, 3), `areas` (t,) float; `patch` (t,) int: of the triangles.
+    """
+    most, few = _VOXELS
+    if patch.max() < most or (np.abs(normals).max(axis=1) < 1 - 1e-9).any():
+        return None
+    widths = np.empty(3)
+    for axis, x in enumerate(vertices.T):
+        gaps = np.diff(np.unique(x))
+        gaps = gaps[gaps > _APART * np.ptp(x)]
+        widths[axis] = gaps.min()
+        if np.abs(gaps / widths[axis] - np.rint(gaps / widths[axis])).max() > _FLAT:
+            return None
+    sides = areas * widths[np.abs(normals).argmax(axis=1)] / widths.prod()
+    return float(widths.max()) if np.median(np.bincount(patch, sides)) <= few else None
 
 
 def sharp_edges(angle: np.ndarray) -> np.ndarray:

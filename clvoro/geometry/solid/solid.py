@@ -29,7 +29,7 @@ from ..surface_files import SOLIDS, FilePath, named_parts, parts_of, read_parts,
 from ..triangles import NamedTriangles, pierced
 from ..wall_triangles import WallTriangles
 from . import primitives
-from .checks import sharp_edges, volume_inside
+from .checks import sharp_edges, volume_inside, voxel_width
 from .combining import around, boolean, named_triangles
 from .creases import (
     CONCAVE,
@@ -172,6 +172,14 @@ class Solid(Domain):
         self.lower, self.upper = tuple(lower.tolist()), tuple(upper.tolist())
         self.names = names
         self.names = self._checked_names()
+        voxel = voxel_width(vertices[triangles].reshape(-1, 3), self.normals, self._areas, self.patch)
+        if voxel is not None:
+            warn(
+                f"{name} is a surface of voxels {voxel:.3g} wide, with creases around {self.n_patches} patches: "
+                "cells of about this size take minutes. Smooth the mask first, with SciPy and scikit-image (see the "
+                "Limits in the guide on solids); for the flow around it pass wrap=, two thirds of the size of cells",
+                MismatchWarning,
+            )
         sharp = sharp_edges(self.creases.angle)
         if sharp.size:
             where = vertices[self.creases.edges[sharp[0]]].mean(axis=0)

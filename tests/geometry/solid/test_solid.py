@@ -1,12 +1,13 @@
 """Solids: where points are, patches and creases, the planes that cut cells; against formulas and slow references."""
 
 import pickle
+import warnings
 
 import numpy as np
 import pytest
 
 from clvoro import Solid
-from clvoro.errors import InputError
+from clvoro.errors import InputError, MismatchWarning
 from clvoro.geometry.columns import Columns
 from clvoro.geometry.triangles import packed_rows, packed_weights, pierced
 
@@ -156,6 +157,25 @@ def test_thin_parts_and_gaps_are_found():
     assert (strait, thin.share) == (None, pytest.approx(2 / 2.6, rel=0.01))
     for solid in (SOLIDS["box"], SOLIDS["ball"], Solid.cone((0, 0, 0), (0, 0, 1), 0.2)):
         assert solid.narrow_parts(lambda x: np.full(len(x), 0.1)) == (None, None)
+
+
+def test_voxels_are_recognized_and_have_a_remedy():
+    """The remedy is that of the guide."""
+    ndimage, measure = pytest.importorskip("scipy.ndimage"), pytest.importorskip("skimage.measure")
+    mask = np.pad(np.linalg.norm(np.moveaxis(np.indices((9, 9, 9)), 0, -1) - 4, axis=-1) < 4.2, 1)
+    corners = []
+    for axis, side in np.ndindex(3, 2):
+        u, v = np.eye(3)[[axis - 2, axis - 1]]
+        at = np.argwhere(mask & ~np.roll(mask, 1 - 2 * side, axis)) + side * np.eye(3)[axis]
+        corners.append(np.stack([at, at + u, at + u + v, at + v][:: 2 * side - 1], axis=1).reshape(-1, 3))
+    quads = np.arange(len(np.concatenate(corners))).reshape(-1, 4)
+    with pytest.warns(MismatchWarning, match="voxels 2 wide, with creases around .* Smooth the mask"):
+        solid = Solid(np.concatenate(corners) * (1, 1, 2), quads[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3))
+    assert solid.measure == 2 * mask.sum()
+    vertices, triangles, _, _ = measure.marching_cubes(ndimage.gaussian_filter(np.pad(mask, 3).astype(float), 0.7), 0.5)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert Solid(vertices, triangles[:, ::-1], angle=60).measure == pytest.approx(mask.sum(), rel=0.15)
 
 
 @pytest.mark.parametrize(
