@@ -524,7 +524,7 @@ class Run:
         if self._is_part:
             parts = ResultParts(mesh.engine, self._domain, CellRows.of(mesh.t, mesh.labels), fixed)
         held = self.arguments.fixed
-        diagram, settings = mesh.fetch_diagram(len(held)), dict(self._settings)
+        diagram, settings = mesh.fetch_diagram(len(held), self._options.method == "exact"), dict(self._settings)
         if self._options.layers and self._domain.extrudes_layers:
             from ..finite_volumes.solid_walls.layers import add_layers
 

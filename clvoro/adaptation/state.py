@@ -13,6 +13,7 @@ import numpy as np
 import pyopencl as cl
 import pyopencl.array as cla
 
+from ..finite_volumes.solid_walls.settling import CellTargets
 from ..geometry.domain import Domain
 from ..geometry.fixed_generators import FixedGenerators
 from ..mesh.diagram import Diagram
@@ -655,11 +656,13 @@ class MeshState:
         """The tessellator that made the present diagram."""
         return self.tessellator if self.power is None or not self.t.is_power else self.power
 
-    def fetch_diagram(self, held: int = 0) -> Diagram:
+    def fetch_diagram(self, held: int = 0, exact: bool = False) -> Diagram:
         """Return the diagram and free the buffers of all stages. The mesh cannot be used afterwards.
 
-        The first `held` generators stay where others are moved because OpenFOAM would reject cells.
+        The first `held` generators stay where others are moved because OpenFOAM would reject cells. At curved walls all
+        but fixed ones settle in the mesh; if it is `exact`, sizes matter more there than shapes.
         """
+        targets = CellTargets(self.to_host(self.h, self.domain.frame[1]) ** self.engine.cell_dim, self.fixed, exact)
         tessellator = self._latest_tessellator
         latest = [tessellator.steps.measure_exactly(self.t)]
         self.tessellation = None
@@ -668,4 +671,4 @@ class MeshState:
         if latest[0].part is not None:
             return fetch_part(engine, self.domain, latest.pop(), self.labels)
         # No list or frame here holds the cells any longer: a solid frees them before it makes others.
-        return fetch_diagram(engine, self.domain, latest.pop(), self.labels, copy=False, held=held)
+        return fetch_diagram(engine, self.domain, latest.pop(), self.labels, copy=False, held=held, targets=targets)

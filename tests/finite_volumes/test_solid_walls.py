@@ -18,6 +18,7 @@ from clvoro.finite_volumes.solid_walls.cures import Cures
 from clvoro.finite_volumes.solid_walls.editing import judge
 from clvoro.finite_volumes.solid_walls.mesh import _Maker, diagram_of, off_middle, outer_generators, solid_diagram
 from clvoro.finite_volumes.solid_walls.near_walls import NearWalls
+from clvoro.finite_volumes.solid_walls.settling import CellTargets, at_concave_creases
 from clvoro.finite_volumes.solid_walls.wall_surface import WallSurface
 
 H = 0.25
@@ -462,3 +463,27 @@ def test_generators_move_to_centroids_where_faces_are_oblique(ctx, monkeypatch, 
     assert (d.faces.measures.non_orthogonality.max() < 20) == straight
     assert np.array_equal(d.points, x) == (not straight or not centerings)
     assert d.volumes.sum() == pytest.approx(1, rel=1e-9)
+
+
+@pytest.mark.parametrize("first", [False, True])
+def test_generators_at_walls_settle(ctx, monkeypatch, first):
+    """Volumes and centroids are closer, those around concave creases stay, and all where a face would be oblique."""
+    solid, held = el(), 5
+    x = generators(solid)
+    h = np.full(len(x), H)
+    volumes = np.full(len(x), solid.measure / len(x))
+    whole = partial(whole_faces, ctx, solid, h=h)
+
+    def made(targets):
+        d = solid_diagram(WallSurface(solid), x, h, whole, targets=targets)
+        return d, np.abs(np.cbrt(d.volumes / volumes) - 1), np.linalg.norm(d.centroids - d.points, axis=1).mean() / H
+
+    (_, before, off_before), (d, after, off) = made(None), made(CellTargets(volumes, held, first))
+    stays = at_concave_creases(WallSurface(solid), x, h)
+    stays[:held] = True
+    assert 0 < stays.sum() < len(x) / 2
+    assert np.array_equal(d.points[stays], x[stays])
+    assert after[~stays].mean() < (0.2 if first else 0.5) * before[~stays].mean()
+    assert first or off < 0.7 * off_before
+    monkeypatch.setattr("clvoro.finite_volumes.solid_walls.settling._WORSE", 0.0)
+    assert np.array_equal(made(CellTargets(volumes, held, first))[0].points, x)

@@ -6,8 +6,6 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
-import numpy as np
-
 from ..estimates import MOST_SURPLUS
 from ..motion import Displacement, Method
 from ..tuning import CLIMB_STRAIN, LEAST_PROGRESS, MAX_OSCILLATIONS, SAMPLING_GAIN
@@ -57,28 +55,11 @@ class Step:
 
 
 @dataclass(frozen=True)
-class StepOfMesh(Step):
-    """A step that gives the cells of the resulting mesh their sizes, also at curved walls.
-
-    There the cells on the device are cut by planes, while those of the mesh end at the surface. A mesh is made before
-    the step, and the step makes up for the difference.
-    """
-
-    def apply(self, run: Run) -> None:
-        """Make a mesh, take the step, and record it."""
-        factors = run.state.sizes_over_mesh()
-        if factors is not None:
-            run.state.h.set(run.state.h.get() * factors)
-        super().apply(run)
-        if factors is not None and run.fixed_count is not None:
-            run.state.multiply_sizes(1 / math.exp(np.log(factors).mean()))
-
-
-@dataclass(frozen=True)
 class CountOfMesh:
-    """Correct the number of generators for the cells of the resulting mesh; see `StepOfMesh`.
+    """Correct the number of generators for the cells of the resulting mesh.
 
-    With a fixed number of cells nothing is done.
+    At curved walls the cells on the device are cut by planes, while those of the mesh end at the surface. With a fixed
+    number of cells nothing is done.
     """
 
     def apply(self, run: Run) -> None:

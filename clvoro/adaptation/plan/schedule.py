@@ -55,7 +55,6 @@ from .actions import (
     RepairCells,
     ResetMomentum,
     Step,
-    StepOfMesh,
 )
 from .efforts import EFFORTS_OF, Effort, choose_error_target
 
@@ -354,9 +353,7 @@ def _finish_3d(effort: Effort, exact: bool, error_target: float, penalty: float)
             correct_mean=True,
             careful=True,
         )
-        *first, last = (replace(newton, tolerance=tolerance) for tolerance in tuning.NEWTON_TOLERANCES_3D)
-        yield from [Step(method) for method in first]
-        yield StepOfMesh(last)
+        yield from [Step(replace(newton, tolerance=tolerance)) for tolerance in tuning.NEWTON_TOLERANCES_3D]
 
 
 def work_of(schedule: list[Action], levels: int, dim: int, cells: float) -> list[float]:

@@ -24,6 +24,7 @@ from .mend import at_wall, changed_cells, narrow_faces, rejected_at_walls, touch
 from .near_walls import NearWalls
 from .pierce import IN, ON, OUT, WALL, pierce_edges, sides, simplified
 from .polygons import Divider, chain_loops, open_sides
+from .settling import THIN, CellTargets, MadeCells, at_concave_creases, settled
 from .trimmed_faces import TrimmedFaces, trim_faces
 from .wall_surface import SNAP_CREASE, WallSurface, nearest
 
@@ -39,11 +40,8 @@ EXACT, FILLED, ROUNDED = range(3)
 """How the walls of a cell are made: with all creases; without concave creases; without creases.
 
 Each next one makes more cells convex, and leaves out more of the surface."""
-_THIN, _ACROSS = 0.7, 0.35
-"""A part of a solid is thin if both walls are nearer to a generator than this share of h; how far generators are spread
-across it, over h."""
-_AROUND = 0.85
-"""Generators nearer to a concave crease than this share of h stay: the faces between their cells meet in it."""
+_ACROSS = 0.35
+"""How far generators are spread across thin parts, over h."""
 _OFF_CENTER = 0.15
 """Least distance over h from which the generators of cells with oblique faces are moved to the centroids."""
 _CENTERINGS = 6
@@ -105,14 +103,21 @@ class _Made:
         oblique = at_generators(pairs.ravel(), len(self.near.points), np.tile(excess, 2))
         return REJECTED * self.count_rejected() + oblique
 
-    def weigh_left(self) -> np.ndarray:
-        """Return the same, where faces are more oblique or skewed than wanted; see `oblique_cells`."""
-        over, found = over_wanted(self.faces.measures), self.oblique_cells()
-        worst = np.zeros(self.faces.n_cells)
+    def worst(self) -> np.ndarray:
+        """Return how oblique or skewed the faces of each generator's cells are, see `over_wanted`, (n + 1,) float."""
+        over, numbers = over_wanted(self.faces.measures), self.near.numbers[self.home]
+        worst = np.zeros(len(self.near.points) + 1)
+        pairs = np.append(numbers, 0)[np.stack([self.faces.owner, np.maximum(self.faces.neighbor, -1)])]
+        kept = (pairs >= 0).all(axis=0)
         for cells in (self.faces.owner, self.faces.neighbor):
-            np.maximum.at(worst, cells[cells >= 0], over[cells >= 0])
-        numbers, n = self.near.numbers[self.home], len(self.near.points)
-        return REJECTED * self.count_rejected() + at_generators(numbers[found], n, worst[found] - 0.9)
+            chosen = kept & (cells >= 0)
+            np.maximum.at(worst, numbers[cells[chosen]], over[chosen])
+        return worst
+
+    def weigh_left(self) -> np.ndarray:
+        """Return the same, where faces are more oblique or skewed than wanted."""
+        worst = self.worst()
+        return REJECTED * self.count_rejected() + np.where(worst > 1, worst - 0.9, 0)
 
     def oblique_cells(self) -> np.ndarray:
         """Return the cells of faces that are more oblique or skewed than wanted, (k,) int."""
@@ -154,13 +159,12 @@ def off_middle(surface: WallSurface, points: np.ndarray, sizes: np.ndarray) -> n
     - `points` (n, 3) float: generators inside.
     - `sizes` (n,) float: h at the generators.
     """
-    near, foot, distance = _close_to(surface, points, _THIN * sizes)
+    near, foot, distance = _close_to(surface, points, THIN * sizes)
     kept = distance < -0.05 * sizes[near]
-    edge = surface.nearest_crease(points[near], _AROUND * sizes[near])[0]
-    kept[edge >= 0] &= ~surface.solid.creases.concave[edge[edge >= 0]]
+    kept &= ~at_concave_creases(surface, points[near], sizes[near])
     near, foot, distance = near[kept], foot[kept], distance[kept]
     across = (points[near] - foot) / -distance[:, None]
-    thin = surface.closest(points[near] + _THIN * sizes[near, None] * across)[2] > 0
+    thin = surface.closest(points[near] + THIN * sizes[near, None] * across)[2] > 0
     near, across, distance = near[thin], across[thin], distance[thin]
     share = (_GOLDEN * np.arange(len(near)) % 1)[:, None] - 0.5
     moved = points.copy()
@@ -185,6 +189,7 @@ def solid_diagram(
     warns: bool = True,
     held: int = 0,
     straight: bool = True,
+    targets: CellTargets | None = None,
 ) -> Diagram:
     """Return the mesh of a solid as a diagram, without short edges at walls.
 
@@ -199,12 +204,16 @@ def solid_diagram(
     - `warns`: whether it warns of what is wrong with the mesh.
     - `held`: how many of the first generators are not moved.
     - `straight`: where faces are oblique, move generators to the centroids of their cells, then turn or collapse faces.
+    - `targets`: generators settle first; see `settled`.
 
     Raises `InputError` if generators have no cell, as the solid is too thin there.
     With `warns` it warns with `MismatchWarning` if generators have no cell, cells are cut, leave out creases, or are
     concave. It says how many, and the first place.
     """
-    mesh = _Trials(surface, points, sizes, whole, tell, held, straight).best()
+    trials = _Trials(surface, points, sizes, whole, tell, held, straight)
+    if targets is not None:
+        trials.settle(targets)
+    mesh = trials.best()
     tell("cells without walls")
     faces, home = mesh.near.put_back(mesh.faces, mesh.home, mesh.own)
     if warns:
@@ -233,6 +242,19 @@ class _Trials:
         self.surface, self.points, self.sizes, self.whole = surface, points, sizes, whole
         self.tell, self.held, self.straight = tell, held, straight
         self._tree, self._turned = scipy.spatial.KDTree(points), None
+
+    def settle(self, targets: CellTargets) -> None:
+        """Move generators before the first mesh; see `settled`."""
+        self.tell("settling of cells at walls")
+        self.points = settled(self.surface, self.points, self.sizes, targets, self._cells)
+        self._tree = scipy.spatial.KDTree(self.points)
+
+    def _cells(self, points: np.ndarray) -> MadeCells:
+        """Return the cells near walls, without cures."""
+        self.surface.recall()
+        near = NearWalls.of(self.surface, points, self.sizes, self.whole(points))
+        made = _shortened(self.surface, _Maker(self.surface, near, np.full(len(near.rows) + 1, EXACT)).mesh())
+        return MadeCells(made.faces, near.numbers[made.home], (made.worst() + REJECTED * made.count_rejected())[:-1])
 
     def best(self) -> _Made:
         """Return the mesh with the fewest rejected cells, then the least oblique faces."""
@@ -329,8 +351,7 @@ class _Trials:
         if surface.widths.min() < SNAP_CREASE * sizes.max(initial=0.0):
             # Generators around narrow facets stay, unless OpenFOAM rejects their own cells.
             beside = np.setdiff1d(np.flatnonzero((trial[:, :3] != state[:, :3]).any(axis=1)), rows)
-            edge = surface.nearest_crease(state[beside, :3], _AROUND * sizes[beside])[0]
-            beside = beside[edge >= 0][surface.solid.creases.concave[edge[edge >= 0]]]
+            beside = beside[at_concave_creases(surface, state[beside, :3], sizes[beside])]
             trial[beside, :3] = state[beside, :3]
         return trial
 
@@ -402,19 +423,12 @@ def _are_many(near: NearWalls, rejected: np.ndarray) -> bool:
     return len(rejected) > max(_MANY, _SHARE * len(near.rows))
 
 
-def _finished(
-    surface: WallSurface, raw: _Made, earlier: Cures | None, tell: Callable[[str], object], spares: bool
-) -> _Made:
-    """Return `raw` cells near the surface without short edges and slivers, cured where OpenFOAM rejects them.
-
-    `earlier` cures are repeated in cells that both meshes share. With `spares`, none is made if they are many.
-    """
-    near, home, own, cures = raw.near, raw.home, raw.own, None
-    tell("short edges at walls")
+def _shortened(surface: WallSurface, raw: _Made) -> _Made:
+    """Return `raw` cells near the surface without short edges and slivers, with walls that keep their volumes."""
+    near, home = raw.near, raw.home
     faces, changed = _collapsed(raw.faces, near.sizes[home])
     chords = faces.points
     faces = balanced(faces, np.maximum(-1 - faces.neighbor, -1), surface.bent, surface.feet)
-    tell("checks of cells at walls")
     changed |= touching_walls(faces)
     rejected = rejected_at_walls(faces, changed)
     if len(rejected) and faces.points is not chords:
@@ -425,14 +439,28 @@ def _finished(
         suspect[rejected] = True
         faces, changed = _collapsed(faces, near.sizes[home], with_neighbors(faces, suspect))
         rejected = rejected_at_walls(faces, with_neighbors(faces, changed | suspect))
+    return replace(raw, faces=faces, rejected=rejected)
+
+
+def _finished(
+    surface: WallSurface, raw: _Made, earlier: Cures | None, tell: Callable[[str], object], spares: bool
+) -> _Made:
+    """Return `raw` cells near the surface without short edges and slivers, cured where OpenFOAM rejects them.
+
+    `earlier` cures are repeated in cells that both meshes share. With `spares`, none is made if they are many.
+    """
+    tell("short edges at walls")
+    made = _shortened(surface, raw)
+    near, faces, home, own, rejected, cures = made.near, made.faces, made.home, made.own, made.rejected, None
     if len(rejected) and not (spares and _are_many(near, rejected)):
+        tell("cells that are rejected at walls")
         names, h = near.numbers[home], near.sizes[home]
-        faces, origin, own, rejected, cures = cured(surface, faces, names, own, h, rejected, earlier, None, tell)
+        faces, origin, own, rejected, cures = cured(surface, faces, names, own, h, rejected, earlier)
         home = home[origin]
     if not own.all():
         centroids = faces.measures.geometry.centroids
         faces = replace(faces, generators=np.where(own[:, None], faces.generators, centroids))
-    return replace(raw, faces=faces, home=home, own=own, rejected=rejected, cures=cures)
+    return replace(made, faces=faces, home=home, own=own, rejected=rejected, cures=cures)
 
 
 def _collapsed(faces: Faces, sizes: np.ndarray, among: np.ndarray | None = None) -> tuple[Faces, np.ndarray]:

@@ -13,6 +13,7 @@ import pyopencl.array as cla
 from ...connectivity import first_nodes, rows_of, starts_of, used_indices
 from ...errors import InputError
 from ...finite_volumes.borders import on_surfaces
+from ...finite_volumes.solid_walls.settling import CellTargets
 from ...geometry.domain import ClipBox, Domain
 from ...geometry.solid.solid import Solid
 from ...mesh.diagram import Diagram
@@ -34,13 +35,20 @@ LEFT_OUT = 1e-5
 
 
 def fetch_diagram(
-    engine: Engine, domain: Domain, t: Tessellation, labels: cla.Array, copy: bool = True, held: int | None = None
+    engine: Engine,
+    domain: Domain,
+    t: Tessellation,
+    labels: cla.Array,
+    copy: bool = True,
+    held: int | None = None,
+    targets: CellTargets | None = None,
 ) -> Diagram:
     """Return `t` as a `Diagram` with rows in the order of `labels` (n,); arrays are read when first used.
 
     - `copy`: copy the arrays of `t`. Without a copy the caller must not reuse these buffers.
     - `held`: how many of the first generators of a run are not moved. Given generators are moved only where OpenFOAM
       would reject cells.
+    - `targets`: of the cells of a run, for those at curved walls; see `settled`.
     """
     sheets = domain.sheets
     if domain.curved_walls:
@@ -49,7 +57,7 @@ def fetch_diagram(
         solid = cast("Solid", domain)
         points, sizes = read_generators(domain, t, labels)
         del t, labels  # memory for another diagram
-        diagram = make_mesh(engine, solid, points, sizes, held=held)
+        diagram = make_mesh(engine, solid, points, sizes, held=held, targets=targets)
 
         def again(points: np.ndarray) -> Diagram:
             return make_mesh(engine, solid, points, sizes, warns=False, spread=False, held=held)

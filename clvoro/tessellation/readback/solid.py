@@ -11,6 +11,7 @@ import pyopencl.array as cla
 
 from ...errors import InputError
 from ...finite_volumes.solid_walls.mesh import off_middle, outer_generators, solid_diagram
+from ...finite_volumes.solid_walls.settling import CellTargets
 from ...finite_volumes.solid_walls.wall_surface import WallSurface
 from ...geometry.box import Box
 from ...geometry.domain import Domain
@@ -56,13 +57,14 @@ def make_mesh(
     warns: bool = True,
     spread: bool = True,
     held: int | None = 0,
+    targets: CellTargets | None = None,
 ) -> Diagram:
     """Return the mesh of a solid by its generators `points` (n, 3), for cells of the `sizes` (n,).
 
     In a run each cell is cut by planes of its own, and cells do not fit together. The mesh has the Voronoi cells of the
     same generators, cut at the surface. With `warns` the function warns of defects of the mesh. With `spread` those in
     thin parts do not stay halfway between the walls. The first `held` generators are not moved; if it is None, all are
-    given, and move only where OpenFOAM would reject cells.
+    given, and move only where OpenFOAM would reject cells. With `targets` generators at walls settle; see `settled`.
     """
     tell = engine.pool.on_work or (lambda _: None)
     tell("diagram of all cells")
@@ -81,7 +83,7 @@ def make_mesh(
         return faces
 
     straight = held is not None and domain.sheets is None
-    made = solid_diagram(surface, points, sizes, whole, tell, warns, held or 0, straight)
+    made = solid_diagram(surface, points, sizes, whole, tell, warns, held or 0, straight, targets if straight else None)
     if len(points) > _COLLECTS:
         gc.collect()  # meshes and their measures name each other: those of trials would stay in memory
     return made
