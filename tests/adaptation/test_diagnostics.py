@@ -300,7 +300,9 @@ def test_sizes_of_their_own_are_not_steep(growth, advice):
     worst = 3
     errors[worst] = 9.0
     sizes[int(diagram.neighbors[slice(*diagram.neighbor_starts[worst : worst + 2])].max())] = 0.05
-    result = SimpleNamespace(diagram=diagram, target_size=sizes, size_error=errors, points=diagram.points, settings={})
+    result = SimpleNamespace(
+        diagram=diagram, target_size=sizes, size_error=errors, points=diagram.points, settings={}, size_factor=1.0
+    )
     with pytest.warns(SizeErrorWarning, match=advice):
         warn_of_errors(result, lambda x: 0.2 + growth * x[:, 0])
 
