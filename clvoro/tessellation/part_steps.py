@@ -61,7 +61,7 @@ GROWTH, SKIN, SHARE = 1.4, 0.25, 0.4
 each ball, as a share of the ball's radius. A part also asks for generators in the skin: they may move into the ball.
 `SHARE`: of the room between the ball that a cell needs and the nearest generator that is not known, what the ball gets;
 the rest is skin."""
-NEAR, FAR, FREE, FEW = 1.25, 2.5, 0.8, 1
+NEAR, FAR, FREE, FEW = 1.25, 2.5, 0.8, 32
 """`NEAR`: largest distance between a ball and a box of another part that are compared, over the largest radius of the
 balls of both; `FAR`: that between a run and such a box, twice as much, so that the balls of other runs do not meet.
 `FREE`: radius around a generator within which all others are known, over its distance from other parts. `FEW`: number
