@@ -192,6 +192,15 @@ def test_walls_follow_the_surface(made):
         assert np.abs(faces.points[walls] - corner).max(axis=1).min() < 1e-12
 
 
+def test_the_tip_of_a_cone_is_a_vertex(ctx):
+    """Its cell has several wall polygons, not one across."""
+    solid = clvoro.Solid.cone((0, 0, 0), (0, 0, 1.5), 0.8)
+    x = generators(solid)
+    h = np.full(len(x), H)
+    faces = solid_diagram(WallSurface(solid), x, h, lambda x: whole_faces(ctx, solid, x, h)).faces
+    assert np.linalg.norm(faces.points - (0, 0, 1.5), axis=1).min() < 0.15 * H
+
+
 def test_walls_cut_off_as_much_as_they_add(made):
     """On balanced walls the depth of polygons has the mean 0, and faces between cells stay as plane as they were."""
     solid, faces = made

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cache
 
@@ -777,14 +777,31 @@ class _Maker:
 
         divider = Divider(self.surface, corners_of, vertex_of, place_of)
         uniform = np.minimum.reduceat(label, starts[:-1]) == np.maximum.reduceat(label, starts[:-1])
+        first, mixed = starts[:-1], np.flatnonzero(~uniform).tolist()
+        for tip, patch, around in self._tips():
+            loops = np.flatnonzero(uniform & (cell[first] == around) & (label[first] == patch))
+            for k in loops.tolist() if len(loops) == 1 else ():
+                uniform[k] = False
+                loop = [*begin[starts[k] : starts[k + 1]].tolist(), int(begin[starts[k]])]
+                top = len(self.points) + len(new_points)
+                new_points.append(self.surface.vertices[tip])
+                for a in range(0, len(loop) - 1, 2):
+                    divider.polygons.add(around, patch, [top, *loop[a : a + 3]])
         self.whole = take_rows(starts, begin, np.flatnonzero(uniform))
         self.whole_cell, self.whole_patch = cell[starts[:-1][uniform]], label[starts[:-1][uniform]]
-        for k in np.flatnonzero(~uniform).tolist():
+        for k in mixed:
             s = slice(starts[k], starts[k + 1])
             divider.divide(int(cell[starts[k]]), begin[s].tolist(), label[s].tolist())
         if new_points:
             self.points = np.concatenate([self.points, new_points])
         return divider
+
+    def _tips(self) -> Iterator[tuple[int, int, int]]:
+        """Return the vertex and the patch of each tip that is straight over a cell, and the cell around it."""
+        tips, patch, straight = self.surface.tips
+        cells = nearest(self.tree, self.surface.vertices[tips])[1]
+        wide = straight >= self.sizes[cells]
+        return zip(tips[wide].tolist(), patch[wide].tolist(), cells[wide].tolist(), strict=True)
 
     def _joined_runs(
         self, cell: np.ndarray, begin: np.ndarray, end: np.ndarray, label: np.ndarray, starts: np.ndarray

@@ -12,6 +12,7 @@ import scipy
 from ...connectivity import distinct, rows_of, starts_of, take_rows
 from ...geometry.bvh import Tree
 from ...geometry.triangles import bent_patches
+from ...geometry.wall_triangles import TIP_COSINE
 
 if TYPE_CHECKING:
     from ...geometry.solid.solid import Solid
@@ -64,6 +65,22 @@ class WallSurface:
     def bent(self) -> np.ndarray:
         """Whether the triangles of each patch are in more than one plane, (p,) bool."""
         return bent_patches(self.solid.surface.areas, self.solid.normals, self.patch, self.n_patches)
+
+    @cached_property
+    def tips(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Tips of patches, as those of cones: vertices (k,), their patches, and how far the patch is straight there.
+
+        All triangles at a tip are steep against the patch's normal there.
+        """
+        x, n = self.triangles, len(self.vertices)
+        steep = np.einsum("tkd,td->tk", self.solid.corner_normals, self.solid.normals) < TIP_COSINE
+        tips = np.flatnonzero(np.bincount(x[steep], minlength=n) == np.maximum(np.bincount(x.ravel(), minlength=n), 3))
+        tips = np.setdiff1d(tips, self.solid.creases.edges)
+        lengths = np.linalg.norm(self.vertices[np.roll(x, -1, axis=1)] - self.vertices[x], axis=2)
+        straight, patch = np.full(n, np.inf), np.zeros(n, np.int64)
+        np.minimum.at(straight, x, np.minimum(lengths, np.roll(lengths, 1, axis=1)))
+        patch[x] = self.patch[:, None]
+        return tips, patch[tips], straight[tips]
 
     def closest(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the closest triangle (k,), the point on it (k, 3), and the distance (k,), negative inside."""
