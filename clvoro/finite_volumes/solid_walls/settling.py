@@ -20,8 +20,9 @@ AROUND = 0.85
 """Generators nearer to a concave crease than this share of h stay: the faces between their cells meet in it."""
 THIN = 0.7
 """A part of a solid is thin if both walls are nearer to a generator than this share of h."""
-_STEPS, _MOST = 5, 50_000
-"""Number of steps, and largest number of moves of cells at walls in all steps."""
+_STEPS, _MOST = 5, 25_000
+"""Number of steps, and largest number of cells in all of them: the fewer cells, the larger is the share of those at
+walls."""
 _EXACT_STEPS, _LEAST = 8, 2
 """The same number by the exact method, and how many of these steps are taken with any number of cells."""
 _FEW = 0.03
@@ -34,6 +35,8 @@ _STAYING = 0.1
 """Weight of the volumes of cells whose generators stay. By the exact method it is 1, as for all others."""
 _GOOD, _WORSE = 0.97, 1.001
 """A face may become as oblique or skewed as this share of what is wanted, or as it was, times the second number."""
+_REACH = 2.5
+"""Largest distance of generators that settle from the surface, over h."""
 _LONGEST, _DEEP = 0.15, 0.05
 """Longest displacement in a step, and least depth of generators in the solid, over h."""
 
@@ -89,12 +92,12 @@ def settled(
     - `sizes` (n,) float: h at the generators.
     - `make`: returns the cells of generators (n, 3).
     """
-    at_walls = int(np.count_nonzero(surface.touches(points, sizes)))
-    steps = _MOST // max(at_walls, 1)
+    steps = _MOST // max(len(points), 1)
     steps = int(np.clip(steps, _LEAST, _EXACT_STEPS)) if targets.first else min(steps, _STEPS)
     good, most = points, np.zeros(len(points))
     stays = _pinned(surface, points, sizes)
     stays[: targets.fixed] = True
+    stays |= ~surface.touches(points, _REACH * sizes)
     for step in range(steps + _CHECKS if steps else 0):
         made = make(points)
         if step == 0:
