@@ -524,8 +524,11 @@ class Run:
         if self._is_part:
             parts = ResultParts(mesh.engine, self._domain, CellRows.of(mesh.t, mesh.labels), fixed)
         held = self.arguments.fixed
-        diagram, settings = mesh.fetch_diagram(len(held), self._options.method == "exact"), dict(self._settings)
-        if self._options.layers and self._domain.extrudes_layers:
+        extrudes = bool(self._options.layers) and self._domain.extrudes_layers
+        # Prisms are squeezed where generators settle at the surface from which they are extruded.
+        targets = None if extrudes else mesh.cell_targets(self._options.method == "exact")
+        diagram, settings = mesh.fetch_diagram(len(held), targets), dict(self._settings)
+        if extrudes:
             from ..finite_volumes.solid_walls.layers import add_layers
 
             diagram, settings["thickness"] = add_layers(diagram, self._options.layers)

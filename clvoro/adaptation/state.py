@@ -656,13 +656,16 @@ class MeshState:
         """The tessellator that made the present diagram."""
         return self.tessellator if self.power is None or not self.t.is_power else self.power
 
-    def fetch_diagram(self, held: int = 0, exact: bool = False) -> Diagram:
+    def cell_targets(self, exact: bool) -> CellTargets:
+        """Return what generators at curved walls settle to; if it is `exact`, sizes matter more than shapes."""
+        return CellTargets(self.to_host(self.h, self.domain.frame[1]) ** self.engine.cell_dim, self.fixed, exact)
+
+    def fetch_diagram(self, held: int = 0, targets: CellTargets | None = None) -> Diagram:
         """Return the diagram and free the buffers of all stages. The mesh cannot be used afterwards.
 
-        The first `held` generators stay where others are moved because OpenFOAM would reject cells. At curved walls all
-        but fixed ones settle in the mesh; if it is `exact`, sizes matter more there than shapes.
+        The first `held` generators stay where others are moved because OpenFOAM would reject cells. At curved walls
+        generators settle to `targets`, if given.
         """
-        targets = CellTargets(self.to_host(self.h, self.domain.frame[1]) ** self.engine.cell_dim, self.fixed, exact)
         tessellator = self._latest_tessellator
         latest = [tessellator.steps.measure_exactly(self.t)]
         self.tessellation = None
