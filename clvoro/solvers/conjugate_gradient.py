@@ -18,6 +18,8 @@ from .linear_system import BreakdownError, Limits, Operator, Precondition, Solut
 # Rows of the partial sums (as in conjugate_gradient.cl) and columns of the record (as in partial_sums.h).
 CURVATURE, _GAMMA, _ROWS = 3, 6, 12
 _SUM_B, _MAX_B, _NORM_B, _NORM_R, _SUM_R, _START, _SUM_X = 0, 1, 2, 4, 8, 10, 11
+_ALONG, _LENGTH = _SUM_B, _START
+"""Rows of (r, q) and (q, q), q = A p, with other parts; these rows are free after the start."""
 RECORD_NORM, RECORD_RUNNING, RECORD_CURVATURE = 0, 2, 3
 _STATE = 8
 _FIRST_READ = 32
@@ -25,6 +27,8 @@ _FIRST_READ = 32
 NEARLY = 1 + 1e-6
 """Ratio of the squared residual to its target below which the host, which knows the sum over all parts, reads from the
 device whether iterations end."""
+CLEARLY = 2
+"""The same ratio, of |r|^2 - 2 alpha (r, q) + alpha^2 (q, q), above which iterations surely go on."""
 
 
 class ConjugateGradient:
@@ -279,7 +283,7 @@ class _Iteration:
         self._r, self._q = (scratch(n, store) for _ in range(2))
         # Each part finds the directions of its ghosts, too.
         self._u, self._p = (scratch(rows, store) for _ in range(2))
-        self._tolerance, self._target = 0.95 * tolerance, 0.0
+        self._tolerance, self._target, self._norm, self._gamma = 0.95 * tolerance, 0.0, 0.0, 0.0
         # On CPUs it costs more to evaluate directions of neighbors again than to store them.
         self._merged = operator.rows is not None and self._engine.group_size > 1
         directions = (self._p, scratch(n, store)) if self._merged else (self._p, self._p)
@@ -326,7 +330,9 @@ class _Iteration:
         self._launch(k.start_residual, self._size, anew, self._center, *vectors, partial, state, self._solver.counts)
         totals = self._engine.sum_over_parts(PartialSums(partial, (_NORM_B, _NORM_R, _SUM_R)))
         if len(totals):
-            self._target = (self._tolerance**2) * totals[0]
+            self._target, self._norm = (self._tolerance**2) * totals[0], float(totals[1])
+        # Rows that are to be summed over all parts with the next exchange.
+        self._left: tuple[int, ...] = ()
         if len(self._p) > len(self._rhs):
             self._p.fill(0)
 
@@ -339,22 +345,48 @@ class _Iteration:
     def iterate(self, k: int) -> bool:
         """Enqueue iteration k. Return whether the residual is known to be within the tolerance.
 
-        It is known where there are other parts, and then not by the last digits.
+        It is known where there are other parts, and then not by the last digits. With a function as preconditioner
+        |r|^2 is summed with the next (r, u), unless it may be within: (p, q) alone makes the parts wait for a sum.
         """
-        if self._precondition is not None:
-            self._precondition(self._r, self._u[: len(self._r)], self._q)
+        function, rows, over = self._precondition, (CURVATURE,), False
+        if function is not None:
+            function(self._r, self._u[: len(self._r)], self._q)
             self._dot_product(_GAMMA + (k & 1), self._r, self._u)
-            self._sum(_GAMMA + (k & 1), of=self._u)
+            over = self._sum_norms(_GAMMA + (k & 1))
         direction, solution = self._find_direction[k & 1], self._update_solution[k & 1]
         direction()
+        totals: list[float] = []
         if not self._merged:
             self._operator.apply(self._p, self._q)
             if not self._operator.writes_curvature:
                 self._dot_product(CURVATURE, self._p, self._q)
-            self._sum(CURVATURE)
+            if function is not None and self._engine.peers.count > 1:
+                self._dot_product(_ALONG, self._r, self._q)
+                self._dot_product(_LENGTH, self._q, self._q)
+                rows = CURVATURE, _ALONG, _LENGTH
+            totals = self._sum(*rows).tolist()
         solution()
-        totals = self._sum(*(row + (k + 1) % 2 for row in self._sums), of=self._u if len(self._sums) > 2 else None)
-        return len(totals) > 0 and totals[0] <= self._target * NEARLY
+        self._left = tuple(row + (k + 1) % 2 for row in self._sums)
+        if len(totals) == 3:
+            curvature, along, length = totals
+            if not self._gamma > 0 < curvature:
+                return True
+            alpha = self._gamma / curvature
+            if self._norm - 2 * alpha * along + alpha**2 * length > self._target * CLEARLY:
+                return over
+        return self._sum_norms() or over
+
+    def _sum_norms(self, *gamma: int) -> bool:
+        """Sum the rows that are left, and `gamma`; return whether this shows a residual within the tolerance."""
+        rows, self._left = self._left + gamma, ()
+        exchanged = len(gamma) > 0 or self._inverse is not None
+        totals = self._sum(*rows, of=self._u if exchanged else None).tolist()
+        if totals and gamma:
+            self._gamma = totals[-1]
+        if len(totals) < 2:
+            return False
+        self._norm = totals[0]
+        return self._norm <= self._target * NEARLY
 
     def _sum(self, *rows: int, of: cla.Array | None = None) -> np.ndarray:
         """Sum these rows over all parts, and get the values of ghosts in `of`, if given; return the totals."""
@@ -365,6 +397,8 @@ class _Iteration:
 
     def record_norm(self) -> None:
         """Record the residual before the next iteration, and whether it is needed."""
+        if self._left:
+            self._sum_norms()
         groups = np.int32(self._engine.groups)
         self._launch_one_group(self._kernels.record_norm, self._solver.counts, *self._tail, groups)
 

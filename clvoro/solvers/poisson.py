@@ -317,9 +317,9 @@ class Poisson:
         most = _MAX_CYCLES if max_iterations is None else max_iterations
         try:
             multigrid = self.set_up_multigrid(system.laplacian, ordering)
-            # An unnecessary iteration costs a cycle, which is much more than a read by the host.
+            # An unnecessary iteration costs a cycle, which is much more than a read by the host. Parts make none.
             last = self._last_iterations
-            lookahead = max(1, min(last - 1, 4)) if last else 4
+            lookahead = most if self.engine.peers.count > 1 else max(1, min(last - 1, 4)) if last else 4
             first = self._run(system, multigrid.apply, most, lookahead, from_zero)
             self._last_iterations = first.iterations
             self._first_iterations = self._first_iterations or first.iterations
