@@ -23,13 +23,13 @@ THIN = 0.7
 _STEPS, _MOST = 5, 25_000
 """Number of steps, and largest number of cells in all of them: the fewer cells, the larger is the share of those at
 walls."""
-_EXACT_STEPS, _LEAST = 8, 2
+_EXACT_STEPS, _LEAST = 12, 2
 """The same number by the exact method, and how many of these steps are taken with any number of cells."""
 _FEW = 0.03
 """Largest share of generators around faces that are more oblique or skewed than wanted with which they settle."""
 _CHECKS = 6
 """How often generators are put back, at most, after the last step."""
-_DAMPING, _EXACT_DAMPING = 0.05, 0.01
+_DAMPING, _EXACT_DAMPING = 0.05, 0.17
 """Weight of displacements over h in the least squares of volumes over h^3."""
 _STAYING = 0.1
 """Weight of the volumes of cells whose generators stay. By the exact method it is 1, as for all others."""
