@@ -8,6 +8,7 @@ The polygon, in 2D alone, is a coast of `--edges` edges with an island. In 3D al
 arrays on the host; "run" has a constant size; "faces" makes its mesh with all faces, "for solvers" that for solvers.
 Microseconds of processor time per cell, over the device's compute units: medians of `--repeat` by turns, after a first
 call. In 3D there are a tenth of the cells. "memory" is the most so far of the whole process, in GB, on the host.
+"quality" is the mean of the cells.
 """
 
 from __future__ import annotations
@@ -25,12 +26,12 @@ from _sites import rough_lake
 import clvoro
 
 
-def figure(*parts: str) -> Callable[[dict[str, Any]], str]:
+def figure(*parts: str, digits: int = 2) -> Callable[[dict[str, Any]], str]:
     """Return the text of a column: the sum of some parts in the box, in the domain, and the ratio."""
 
     def text(row: dict[str, Any]) -> str:
         box, domain = (sum(row[name][part] for part in parts) for name in ("box", "domain"))
-        return f"{box:.2f}, {domain:.2f}, {domain / box:.2f}"
+        return f"{box:.{digits}f}, {domain:.{digits}f}, {domain / box:.2f}"
 
     return text
 
@@ -42,6 +43,7 @@ COLUMNS = {
     "run": figure("run"),
     "run, faces and for solvers": figure("run", "faces", "for solvers"),
     "memory": figure("memory"),
+    "quality": figure("quality", digits=3),
 }
 
 
@@ -78,11 +80,13 @@ def compare(
             for part, work in parts.items():
                 began = time.process_time()
                 made = work(made)
+                if part == "run":
+                    taken[name, "quality"] = [0.0, float(made.quality.mean())]
                 taken.setdefault((name, part), []).append(time.process_time() - began)
             taken.setdefault((name, "memory"), [0.0, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20])
     found: dict[str, dict[str, float]] = {name: {} for name in domains}
     for (name, part), values in taken.items():
-        scale = 1 if part == "memory" else 1e6 / n / adapter.ctx.devices[0].max_compute_units
+        scale = 1 if part in ("memory", "quality") else 1e6 / n / adapter.ctx.devices[0].max_compute_units
         found[name][part] = scale * statistics.median(values[1:])
     return found
 
