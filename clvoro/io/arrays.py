@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import zipfile
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
@@ -21,6 +22,7 @@ EXPANSION, LEAST = 16, 1 << 22
 compress by a factor of two or three, lattices by nine."""
 _FLATTEST, _SMALL = 256, 1 << 24  # the same for one array, which may be nearly constant
 _PIECE = 1 << 22  # bytes per read
+_parsing = threading.Lock()  # Python 3.11 may fail where two threads make syntax trees, as NumPy does of headers
 
 
 class FileError(Exception):
@@ -167,8 +169,9 @@ def _read(stream: BufferedIOBase, name: str, size: int) -> np.ndarray:
 
 def _read_header(stream: BufferedIOBase) -> tuple[tuple[int, ...], bool, np.dtype]:
     version = np.lib.format.read_magic(stream)
-    if version == (1, 0):
-        return np.lib.format.read_array_header_1_0(stream)
-    if version == (2, 0):
-        return np.lib.format.read_array_header_2_0(stream)
+    with _parsing:
+        if version == (1, 0):
+            return np.lib.format.read_array_header_1_0(stream)
+        if version == (2, 0):
+            return np.lib.format.read_array_header_2_0(stream)
     raise ValueError(f"its header's version is {version}")

@@ -7,8 +7,10 @@ import json
 import os
 import pickle
 import stat
+import time
 import xml.etree.ElementTree as ElementTree
 import zipfile
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -256,6 +258,24 @@ def test_every_truncation_and_changed_byte_is_detected(result, tmp_path):
         # Some bytes of a zip file have no effect: dates, attributes, extra fields.
         assert_same_array(back.size_error, result.size_error)
         assert_same_array(back.diagram.cell_vertices, result.diagram.cell_vertices)
+
+
+def test_threads_read_headers_in_turn(tmp_path, monkeypatch):
+    """Devices share a run in threads. In Python 3.11 two of them may fail if both parse a header at the same time."""
+    parse, inside = np.lib.format.read_array_header_1_0, []
+
+    def noted(stream):
+        inside.append(stream)
+        time.sleep(1e-3)
+        assert inside == [stream]
+        inside.clear()
+        return parse(stream)
+
+    monkeypatch.setattr(np.lib.format, "read_array_header_1_0", noted)
+    np.save(tmp_path / "rows.npy", np.arange(3))
+    with ThreadPoolExecutor(2) as threads:
+        found = list(threads.map(io.arrays.read_array, [tmp_path / "rows.npy"] * 4))
+    assert np.array_equal(found, [np.arange(3)] * 4)
 
 
 # --- other programs ---
