@@ -1,25 +1,23 @@
 """Runs over the ranks of MPI: bits, sizes and shapes, processor time, and what ranks exchange.
 
     python bench/parallel.py [--ranks 1,2,4,8] [--cells 10000] [--dims 2,3] [--effort fast] [--periodic]
-                             [--sphere] [--polygon] [--random] [--device NAME] [--dtype float32] [--json]
+                             [--sphere] [--polygon] [--random] [--balls 100,80] [--device NAME] [--json]
     python bench/parallel.py --model [--cells 1e7] [--json]
 
-For each number of ranks the script starts itself under `mpiexec`; with PoCL each rank has one core. `bits` says whether
-the diagram of random points has the same bits as with the first number of ranks. The other columns are of a run in a
-box, on a sphere, or in a lake, with sizes from h to 3 h, after the same run once, which loads kernels; with `--random`
-it begins with random generators. `CPU s` is the processor time of its work, summed over ranks, `host` the part of it
-that is not kernels and copies on the device, and `over one` the ratio of `CPU s` to that of the first number of ranks.
-`waiting` is the processor time of waits for other ranks, which ask and sleep by turns. `floor` is the ratio for as many
-processes at the same time that each make a mesh of n / p cells without messages. `exchanges` and `reductions` are the
-rounds of messages between pairs of ranks, and of sums over all ranks, per step in which all ranks work; `waits` counts
-how often a rank waits for others, as some of both take place at the same time. `ghosts` is the number of ghosts of rank
-0 in the last diagram over 2 d (n / p)^((d - 1) / d), an estimate of one layer of cells around a part, and `over least`
-that of all ranks over the least possible one: the neighbors of own cells, and in 2D the neighbors of these, as the
-cells of ghosts beside own ones must be known, too. `proof` is the same ratio for those ghosts that prove that all cells
-are final; the others are room to move. `one round` is the share of diagrams whose cells were made once, since no ghosts
-were missing, and `asked` how often ranks asked each other for all ghosts anew, over the number of diagrams. `memory` is
+The script starts itself under `mpiexec`; with PoCL each rank has one core. `bits` says whether the diagram of random
+points has the same bits as with the first number of ranks. The other columns are of a run in a box, on a sphere, or in
+a lake, with sizes from h to 3 h, after the same run once, which loads kernels. `CPU s` is the processor time of its
+work, summed over ranks, `host` the part of it that is not kernels and copies on the device, and `over one` the ratio of
+`CPU s` to that of the first number of ranks. `waiting` is that of waits for other ranks. `floor` is the ratio for as
+many processes at the same time that each make a mesh of n / p cells without messages. `exchanges` and `reductions` are
+the rounds of messages between pairs, and of sums over all, per step in which all ranks work; `waits` counts how often a
+rank waits for others, as some of both take place at the same time. `ghosts` is the number of ghosts of rank 0 at last
+over 2 d (n / p)^((d - 1) / d), an estimate of one layer of cells, and `over least` that of all ranks over the least
+possible one: the neighbors of own cells, and in 2D the neighbors of these. `proof` is the same ratio for those ghosts
+that prove that all cells are final; the others are room to move. `one round` is the share of diagrams whose cells were
+made once, and `asked` how often ranks asked each other for all ghosts anew, over the number of diagrams. `memory` is
 the largest device memory of a rank, in the run and while its cells are read, over that of the first number of ranks.
-Needs `pip install -e '.[mpi]'`.
+`balls` is the radius in which ranks ask for ghosts, in percent of the usual one. Needs `pip install -e '.[mpi]'`.
 
 `--model` measures nothing: it prints the time of a step on up to 1,000 GPUs with so many cells each, by `MODEL`. Runs
 themselves end at 2e9 cells, the limit of 32-bit labels.
@@ -45,12 +43,14 @@ import clvoro
 from clvoro.adaptation.run import Run
 from clvoro.opencl import memory_limits
 from clvoro.opencl.peers import Ranks
+from clvoro.tessellation import part_steps
 from clvoro.tessellation.device_diagram import Tessellation
 from clvoro.tessellation.part import Part
 from clvoro.tessellation.part_steps import NOISE, PartSteps, inside
 
 COLUMNS = {
     "ranks": shown("ranks", "d"),
+    "balls": shown("balls", "d"),
     "cells": shown("cells", ",d"),
     "bits": shown("bits", "s"),
     "mean e": shown("error", ".4f"),
@@ -136,8 +136,9 @@ def measure_rank(options: argparse.Namespace) -> None:
     x, dim = np.random.default_rng(1).random((cells, dim)) - 0.5 * options.sphere, domain.cell_dim
     x = x[domain.contains(x)] if options.polygon else x
     adapter = clvoro.Adapter(clvoro.create_context(options.device), options.dtype, comm=comm)
-    peers = adapter._peers
-    finish = PartSteps._finished
+    peers, finish = adapter._peers, PartSteps._finished
+    part_steps.FIRST_REACH[dim] *= options.balls[0] / 100
+    part_steps.GROWTH *= options.balls[0] / 100
 
     def noted(steps, part, *given):
         before = steps.asked
@@ -201,15 +202,14 @@ def measure_rank(options: argparse.Namespace) -> None:
     ghosts = len(last_made[0]._rows) if comm.size > 1 else 0
     of_all, proof = comm.allreduce(np.array([ghosts, proving(*last_made) if comm.size > 1 else 0]))
     whole, labels = mesh.gather(), comm.gather(mesh.parts.labels if mesh.parts else np.arange(len(mesh)))
-    steps = int(mesh.history["step"][-1])
-    per_part = mesh.history["cells"][-1] / comm.size
-    layer = 2 * dim * per_part ** ((dim - 1) / dim)
+    layer = 2 * dim * (mesh.history["cells"][-1] / comm.size) ** ((dim - 1) / dim)
     if comm.rank == 0:
         last, together = mesh.history[-1], np.array([row[1:] for row in calls if row[0]])
         done, exchanges, reductions, halts = together[-1] - together[0]
         least = max(least_ghosts(whole, labels, 4 - dim), 1)
         figures = {
             "ranks": comm.size,
+            "balls": options.balls[0],
             "cells": int(last["cells"]),
             "digest": digest.hexdigest(),
             "error": float(last["mean_error"]),
@@ -217,7 +217,7 @@ def measure_rank(options: argparse.Namespace) -> None:
             "host": host,
             "waiting": waits,
             "least": alone,
-            "iterations": float(mesh.history["iterations"].sum() / steps),
+            "iterations": float(mesh.history["iterations"].sum() / last["step"]),
             "exchanges": exchanges / done,
             "reductions": reductions / done,
             "waits": halts / done,
@@ -241,6 +241,7 @@ def main() -> None:
     p.add_argument("--periodic", action="store_true", help="a box without walls")
     p.add_argument("--sphere", action="store_true", help="a sphere in place of boxes")
     p.add_argument("--polygon", action="store_true", help="a lake in place of boxes")
+    p.add_argument("--balls", type=counts, default=[100], help="percent of the usual radius of balls")
     p.add_argument("--random", action="store_true", help="begin with random generators")
     p.add_argument("--rank", type=int, help="dimension for which each rank measures; used by the script itself")
     p.add_argument("--model", action="store_true", help="print the model of a step on many GPUs")
@@ -258,14 +259,13 @@ def main() -> None:
         return
     for dim in [3] if options.sphere else [2] if options.polygon else options.dims:
         table, first = Report(options.json, COLUMNS), {}
-        for ranks in options.ranks:
-            found = run_ranks(ranks, [__file__, *sys.argv[1:], "--rank", str(dim)], check=True)
+        for ranks, balls in [(ranks, balls) for ranks in options.ranks for balls in options.balls]:
+            found = run_ranks(ranks, [__file__, *sys.argv[1:], f"--rank={dim}", f"--balls={balls}"], check=True)
             record = json.loads(found.stdout.splitlines()[-1])
             first = first or record
-            bits = "same" if record["digest"] == first["digest"] else "differ"
-            ratios = {"over_one": record["cpu"] / first["cpu"], "floor": record["least"] / first["least"]}
-            ratios["memory"] = record["taken"] / first["taken"]
-            table.add(record | {"bits": bits, **ratios})
+            bits = {"bits": "same" if record["digest"] == first["digest"] else "differ"}
+            ratios = {"over_one": "cpu", "floor": "least", "memory": "taken"}
+            table.add(record | bits | {ratio: record[name] / first[name] for ratio, name in ratios.items()})
         table.finish(f"Ranks {'on a sphere' if options.sphere else f'in {dim}D'}, effort {options.effort}")
 
 
