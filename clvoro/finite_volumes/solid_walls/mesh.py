@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache
 
@@ -246,15 +247,20 @@ class _Trials:
     def settle(self, targets: CellTargets) -> None:
         """Move generators before the first mesh; see `settled`."""
         self.tell("settling of cells at walls")
-        self.points = settled(self.surface, self.points, self.sizes, targets, self._cells)
+        with suppress(InputError):  # the solid is too thin: that is said of the mesh itself
+            self.points = settled(self.surface, self.points, self.sizes, targets, self._cells)
         self._tree = scipy.spatial.KDTree(self.points)
 
     def _cells(self, points: np.ndarray) -> MadeCells:
         """Return the cells near walls, without cures."""
         self.surface.recall()
         near = NearWalls.of(self.surface, points, self.sizes, self.whole(points))
-        made = _shortened(self.surface, _Maker(self.surface, near, np.full(len(near.rows) + 1, EXACT)).mesh())
-        return MadeCells(made.faces, near.numbers[made.home], (made.worst() + REJECTED * made.count_rejected())[:-1])
+        raw = _Maker(self.surface, near, np.full(len(near.rows) + 1, EXACT)).mesh()
+        _check_lost(self.surface, near, raw.home)
+        made = _shortened(self.surface, raw)
+        worst = (made.worst() + REJECTED * made.count_rejected())[:-1]
+        worst[np.setdiff1d(near.rows, near.numbers[made.home])] = REJECTED
+        return MadeCells(made.faces, near.numbers[made.home], worst)
 
     def best(self) -> _Made:
         """Return the mesh with the fewest rejected cells, then the least oblique faces."""
