@@ -525,7 +525,7 @@ class Run:
             parts = ResultParts(mesh.engine, self._domain, CellRows.of(mesh.t, mesh.labels), fixed)
         held = self.arguments.fixed
         extrudes = bool(self._options.layers) and self._domain.extrudes_layers
-        # Prisms are squeezed where generators settle at the surface from which they are extruded.
+        # Layers of prisms become thinner where generators below them have settled.
         targets = None if extrudes else mesh.cell_targets(self._options.method == "exact")
         diagram, settings = mesh.fetch_diagram(len(held), targets), dict(self._settings)
         if extrudes:

@@ -18,7 +18,7 @@ from clvoro.finite_volumes.solid_walls.cures import Cures
 from clvoro.finite_volumes.solid_walls.editing import judge
 from clvoro.finite_volumes.solid_walls.mesh import _Maker, diagram_of, off_middle, outer_generators, solid_diagram
 from clvoro.finite_volumes.solid_walls.near_walls import NearWalls
-from clvoro.finite_volumes.solid_walls.settling import CellTargets, at_concave_creases
+from clvoro.finite_volumes.solid_walls.settling import CellTargets
 from clvoro.finite_volumes.solid_walls.wall_surface import WallSurface
 
 H = 0.25
@@ -488,7 +488,7 @@ def test_generators_at_walls_settle(ctx, monkeypatch, first):
         return d, np.abs(np.cbrt(d.volumes / volumes) - 1), np.linalg.norm(d.centroids - d.points, axis=1).mean() / H
 
     (_, before, off_before), (d, after, off) = made(None), made(CellTargets(volumes, held, first))
-    stays = at_concave_creases(WallSurface(solid), x, h)
+    stays = WallSurface(solid).at_concave_creases(x, h)
     stays[:held] = True
     assert 0 < stays.sum() < len(x) / 2
     assert np.array_equal(d.points[stays], x[stays])

@@ -25,7 +25,7 @@ from .mend import at_wall, changed_cells, narrow_faces, rejected_at_walls, touch
 from .near_walls import NearWalls
 from .pierce import IN, ON, OUT, WALL, pierce_edges, sides, simplified
 from .polygons import Divider, chain_loops, open_sides
-from .settling import THIN, CellTargets, MadeCells, at_concave_creases, settled
+from .settling import CellTargets, MadeCells, settled
 from .trimmed_faces import TrimmedFaces, trim_faces
 from .wall_surface import SNAP_CREASE, WallSurface, nearest
 
@@ -136,7 +136,7 @@ def outer_generators(surface: WallSurface, points: np.ndarray, sizes: np.ndarray
     - `points` (n, 3) float: generators inside.
     - `sizes` (n,) float: h at the generators.
     """
-    near, foot, distance = _close_to(surface, points, 1.5 * sizes)
+    near, foot, distance = surface.close_to(points, 1.5 * sizes)
     h = sizes[near]
     normal = foot - points[near]
     normal /= np.maximum(np.linalg.norm(normal, axis=1), 1e-300)[:, None]
@@ -160,25 +160,11 @@ def off_middle(surface: WallSurface, points: np.ndarray, sizes: np.ndarray) -> n
     - `points` (n, 3) float: generators inside.
     - `sizes` (n,) float: h at the generators.
     """
-    near, foot, distance = _close_to(surface, points, THIN * sizes)
-    kept = distance < -0.05 * sizes[near]
-    kept &= ~at_concave_creases(surface, points[near], sizes[near])
-    near, foot, distance = near[kept], foot[kept], distance[kept]
-    across = (points[near] - foot) / -distance[:, None]
-    thin = surface.closest(points[near] + THIN * sizes[near, None] * across)[2] > 0
-    near, across, distance = near[thin], across[thin], distance[thin]
+    near, across, depth = surface.thin_parts(points, sizes)
     share = (_GOLDEN * np.arange(len(near)) % 1)[:, None] - 0.5
     moved = points.copy()
-    moved[near] += share * np.minimum(_ACROSS * sizes[near], -distance)[:, None] * across
+    moved[near] += share * np.minimum(_ACROSS * sizes[near], depth)[:, None] * across
     return moved
-
-
-def _close_to(surface: WallSurface, points: np.ndarray, reach: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the rows of points nearer to the surface than `reach` (n,), their feet on it and signed distances."""
-    near = np.flatnonzero(surface.touches(points, reach))
-    _, foot, distance = surface.closest(points[near])
-    close = np.abs(distance) < reach[near]
-    return near[close], foot[close], distance[close]
 
 
 def solid_diagram(
@@ -205,7 +191,7 @@ def solid_diagram(
     - `warns`: whether it warns of what is wrong with the mesh.
     - `held`: how many of the first generators are not moved.
     - `straight`: where faces are oblique, move generators to the centroids of their cells, then turn or collapse faces.
-    - `targets`: generators settle first; see `settled`.
+    - `targets`: move generators near walls first; see `settled`.
 
     Raises `InputError` if generators have no cell, as the solid is too thin there.
     With `warns` it warns with `MismatchWarning` if generators have no cell, cells are cut, leave out creases, or are
@@ -243,6 +229,7 @@ class _Trials:
         self.surface, self.points, self.sizes, self.whole = surface, points, sizes, whole
         self.tell, self.held, self.straight = tell, held, straight
         self._tree, self._turned = scipy.spatial.KDTree(points), None
+        self._uncured: _Made | None = None
 
     def settle(self, targets: CellTargets) -> None:
         """Move generators before the first mesh; see `settled`."""
@@ -254,13 +241,21 @@ class _Trials:
     def _cells(self, points: np.ndarray) -> MadeCells:
         """Return the cells near walls, without cures."""
         self.surface.recall()
-        near = NearWalls.of(self.surface, points, self.sizes, self.whole(points))
-        raw = _Maker(self.surface, near, np.full(len(near.rows) + 1, EXACT)).mesh()
-        _check_lost(self.surface, near, raw.home)
-        made = _shortened(self.surface, raw)
+        made = self._uncured = self._made(np.column_stack([points, np.full(len(points), EXACT)]), None)
+        numbers = made.near.numbers[made.home]
         worst = (made.worst() + REJECTED * made.count_rejected())[:-1]
-        worst[np.setdiff1d(near.rows, near.numbers[made.home])] = REJECTED
-        return MadeCells(made.faces, near.numbers[made.home], worst)
+        worst[np.setdiff1d(made.near.rows, numbers)] = REJECTED
+        return MadeCells(made.faces, numbers, worst)
+
+    def _made(self, state: np.ndarray, near: NearWalls | None) -> _Made:
+        """Return the mesh of a state before cures; `near` are its cells near walls, if they are known."""
+        points = state[:, :3]
+        if near is None or not np.array_equal(near.points, points):
+            near = NearWalls.of(self.surface, points, self.sizes, self.whole(points))
+        self.tell(f"walls of {len(near.rows)} cells")
+        raw = _Maker(self.surface, near, np.append(state[near.rows, 3], EXACT)).mesh()
+        _check_lost(self.surface, near, raw.home)
+        return _shortened(self.surface, raw)
 
     def best(self) -> _Made:
         """Return the mesh with the fewest rejected cells, then the least oblique faces."""
@@ -314,22 +309,19 @@ class _Trials:
 
     def _remade(self, state: np.ndarray, last: _Made | None) -> _Made | None:
         """Return the mesh of a state, if there is one. What it shares with the `last` mesh is taken from there."""
-        points, near = state[:, :3], None if last is None else last.near
         self.surface.recall()
         if last is not None and last.cures is not None and last.cures.are_spent:
             return None
-        if near is None or not np.array_equal(near.points, points):
-            near = NearWalls.of(self.surface, points, self.sizes, self.whole(points))
+        made, self._uncured = self._uncured, None
         try:
-            self.tell(f"walls of {len(near.rows)} cells")
-            raw = _Maker(self.surface, near, np.append(state[near.rows, 3], EXACT)).mesh()
-            _check_lost(self.surface, near, raw.home)
+            if made is None or not np.array_equal(made.near.points, state[:, :3]):
+                made = self._made(state, None if last is None else last.near)
         except InputError:  # a simpler cell of a thin part may be nothing
             if last is None:
                 raise
             return None
         cures, spares = None if last is None else last.cures, self.straight and last is None
-        self._latest = _finished(self.surface, raw, cures, self.tell, spares)
+        self._latest = _finished(self.surface, made, cures, self.tell, spares)
         return self._latest
 
     def _remade_straight(self, state: np.ndarray, last: _Made | None) -> _Made | None:
@@ -357,7 +349,7 @@ class _Trials:
         if surface.widths.min() < SNAP_CREASE * sizes.max(initial=0.0):
             # Generators around narrow facets stay, unless OpenFOAM rejects their own cells.
             beside = np.setdiff1d(np.flatnonzero((trial[:, :3] != state[:, :3]).any(axis=1)), rows)
-            beside = beside[at_concave_creases(surface, state[beside, :3], sizes[beside])]
+            beside = beside[surface.at_concave_creases(state[beside, :3], sizes[beside])]
             trial[beside, :3] = state[beside, :3]
         return trial
 
@@ -449,14 +441,12 @@ def _shortened(surface: WallSurface, raw: _Made) -> _Made:
 
 
 def _finished(
-    surface: WallSurface, raw: _Made, earlier: Cures | None, tell: Callable[[str], object], spares: bool
+    surface: WallSurface, made: _Made, earlier: Cures | None, tell: Callable[[str], object], spares: bool
 ) -> _Made:
-    """Return `raw` cells near the surface without short edges and slivers, cured where OpenFOAM rejects them.
+    """Return the cells `made` near the surface, cured where OpenFOAM rejects them.
 
     `earlier` cures are repeated in cells that both meshes share. With `spares`, none is made if they are many.
     """
-    tell("short edges at walls")
-    made = _shortened(surface, raw)
     near, faces, home, own, rejected, cures = made.near, made.faces, made.home, made.own, made.rejected, None
     if len(rejected) and not (spares and _are_many(near, rejected)):
         tell("cells that are rejected at walls")

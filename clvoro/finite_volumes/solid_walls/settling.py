@@ -1,7 +1,8 @@
-"""Settle generators at walls in the mesh as it is: towards the centroids of their cells, and to their volumes.
+"""Move generators near walls a little after a run, by the cells of the mesh that is made of them.
 
-While generators move on the device, planes of its own cut each cell at a wall. The cells of the mesh end at the surface
-and fit together. So their volumes and centroids differ, most at creases and where walls are more curved than cells.
+During a run each cell at a wall ends at planes of its own. In the mesh cells end at the surface and fit together. So
+their volumes and centroids differ from those of the run, most at creases and where the surface curves within a cell. A
+few steps with the cells of the mesh make up for that: generators "settle".
 """
 
 from __future__ import annotations
@@ -16,25 +17,22 @@ from ...mesh.faces import Faces
 from .mend import with_neighbors
 from .wall_surface import WallSurface
 
-AROUND = 0.85
-"""Generators nearer to a concave crease than this share of h stay: the faces between their cells meet in it."""
-THIN = 0.7
-"""A part of a solid is thin if both walls are nearer to a generator than this share of h."""
 _STEPS, _MOST = 5, 25_000
-"""Number of steps, and largest number of cells in all of them: the fewer cells, the larger is the share of those at
-walls."""
+"""Largest number of steps, and largest product of the number of steps and that of cells: each step makes a mesh of all
+cells, and of many cells few are at walls."""
 _EXACT_STEPS, _LEAST = 12, 2
-"""The same number by the exact method, and how many of these steps are taken with any number of cells."""
+"""Largest and least number of steps by the exact method."""
 _FEW = 0.03
-"""Largest share of generators around faces that are more oblique or skewed than wanted with which they settle."""
+"""No generator settles if more than this share of them has a face that is more oblique or skewed than wanted."""
 _CHECKS = 6
-"""How often generators are put back, at most, after the last step."""
+"""Largest number of meshes that are made after the last step to put generators back."""
 _DAMPING, _EXACT_DAMPING = 0.05, 0.17
-"""Weight of displacements over h in the least squares of volumes over h^3."""
+"""Damping of the least squares: the weight of displacements over h, where volumes over h^3 have the weight 1."""
 _STAYING = 0.1
-"""Weight of the volumes of cells whose generators stay. By the exact method it is 1, as for all others."""
+"""Weight of the volume of a cell whose generator stays. By the exact method it is 1."""
 _GOOD, _WORSE = 0.97, 1.001
-"""A face may become as oblique or skewed as this share of what is wanted, or as it was, times the second number."""
+"""A face may become as oblique or skewed as the first share of what is wanted. If it was worse before, it may become
+worse by the second factor, which is round-off."""
 _REACH = 2.5
 """Largest distance of generators that settle from the surface, over h."""
 _LONGEST, _DEEP = 0.15, 0.05
@@ -43,7 +41,7 @@ _LONGEST, _DEEP = 0.15, 0.05
 
 @dataclass(frozen=True)
 class CellTargets:
-    """What generators settle to.
+    """What the steps after a run aim at.
 
     - `volumes` (n,) float: those that their cells are to have.
     - `fixed`: how many of the first generators stay.
@@ -95,9 +93,8 @@ def settled(
     steps = _MOST // max(len(points), 1)
     steps = int(np.clip(steps, _LEAST, _EXACT_STEPS)) if targets.first else min(steps, _STEPS)
     good, most = points, np.zeros(len(points))
-    stays = _pinned(surface, points, sizes)
-    stays[: targets.fixed] = True
-    stays |= ~surface.touches(points, _REACH * sizes)
+    stays = surface.at_concave_creases(points, sizes) | ~surface.touches(points, _REACH * sizes)
+    stays[: targets.fixed] = stays[surface.thin_parts(points, sizes)[0]] = True
     for step in range(steps + _CHECKS if steps else 0):
         made = make(points)
         if step == 0:
@@ -116,26 +113,6 @@ def settled(
             points = points + _step(surface, made, points, sizes, targets, stays)
         points = np.where(back[:, None], good, points)
     return good
-
-
-def _pinned(surface: WallSurface, points: np.ndarray, sizes: np.ndarray) -> np.ndarray:
-    """Return the generators around concave creases and in thin parts, (n,) bool."""
-    found = at_concave_creases(surface, points, sizes)
-    near = np.flatnonzero(surface.touches(points, THIN * sizes))
-    foot, distance = surface.closest(points[near])[1:]
-    inside = (distance < 0) & (-distance < THIN * sizes[near])
-    near, foot, distance = near[inside], foot[inside], distance[inside]
-    across = (points[near] - foot) / -distance[:, None]
-    found[near[surface.closest(points[near] + THIN * sizes[near, None] * across)[2] > 0]] = True
-    return found
-
-
-def at_concave_creases(surface: WallSurface, points: np.ndarray, sizes: np.ndarray) -> np.ndarray:
-    """Return the points (n, 3) nearer to a concave crease than `AROUND` times their `sizes` (n,), as (n,) bool."""
-    edge = surface.nearest_crease(points, AROUND * sizes)[0]
-    found = edge >= 0
-    found[found] = surface.solid.creases.concave[edge[found]]
-    return found
 
 
 def _step(
@@ -174,5 +151,5 @@ def _step(
     way *= np.minimum(1, _LONGEST * sizes / np.maximum(np.linalg.norm(way, axis=1), 1e-300))[:, None]
     moved = np.flatnonzero(way.any(axis=1))
     there, h = points[moved] + way[moved], sizes[moved]
-    way[moved[(surface.closest(there)[2] > -_DEEP * h) | at_concave_creases(surface, there, h)]] = 0
+    way[moved[(surface.closest(there)[2] > -_DEEP * h) | surface.at_concave_creases(there, h)]] = 0
     return way

@@ -21,6 +21,11 @@ SNAP_CREASE = 0.06
 """Wall vertices this close to a crease, as a share of h, are moved onto it."""
 SNAP_CORNER = 0.12
 """The same for corners."""
+_AROUND = 0.85
+"""Generators nearer to a concave crease than this share of h stay: the faces between their cells meet in it."""
+_THIN, _DEEP = 0.7, 0.05
+"""A part of a solid is thin if both walls are nearer to a generator than the first share of h. Generators that are less
+deep than the second do not count."""
 _FEW, _MOST_KEPT = 64, 1 << 19
 """Answers for fewer points at a time are not kept; how many are, at most."""
 
@@ -121,6 +126,33 @@ class WallSurface:
         found = np.zeros(len(points), bool)
         found[self.solid.surface.tree.within(points, reach)[0]] = True
         return found
+
+    def close_to(self, points: np.ndarray, reach: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the rows of points nearer to the surface than `reach` (n,), their feet on it and signed distances."""
+        near = np.flatnonzero(self.touches(points, reach))
+        _, foot, distance = self.closest(points[near])
+        close = np.abs(distance) < reach[near]
+        return near[close], foot[close], distance[close]
+
+    def at_concave_creases(self, points: np.ndarray, sizes: np.ndarray) -> np.ndarray:
+        """Return whether each point (n, 3) is close to a concave crease, for cells of the `sizes` (n,); (n,) bool."""
+        edge = self.nearest_crease(points, _AROUND * sizes)[0]
+        found = edge >= 0
+        found[found] = self.solid.creases.concave[edge[found]]
+        return found
+
+    def thin_parts(self, points: np.ndarray, sizes: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the points (n, 3) between two walls that are close, for cells of the `sizes` (n,), not at creases.
+
+        These are their rows (k,), directions away from the nearer wall (k, 3), and distances from it (k,).
+        """
+        near, foot, distance = self.close_to(points, _THIN * sizes)
+        kept = distance < -_DEEP * sizes[near]
+        kept &= ~self.at_concave_creases(points[near], sizes[near])
+        near, foot, depth = near[kept], foot[kept], -distance[kept]
+        across = (points[near] - foot) / depth[:, None]
+        thin = self.closest(points[near] + _THIN * sizes[near, None] * across)[2] > 0
+        return near[thin], across[thin], depth[thin]
 
     @cached_property
     def _crease_tree(self) -> Tree:

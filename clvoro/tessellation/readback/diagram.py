@@ -48,7 +48,7 @@ def fetch_diagram(
     - `copy`: copy the arrays of `t`. Without a copy the caller must not reuse these buffers.
     - `held`: how many of the first generators of a run are not moved. Given generators are moved only where OpenFOAM
       would reject cells.
-    - `targets`: of the cells of a run, for those at curved walls; see `settled`.
+    - `targets`: volumes that the cells of a run are to have; generators near curved walls move to them, see `settled`.
     """
     sheets = domain.sheets
     if domain.curved_walls:

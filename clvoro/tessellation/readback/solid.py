@@ -64,7 +64,7 @@ def make_mesh(
     In a run each cell is cut by planes of its own, and cells do not fit together. The mesh has the Voronoi cells of the
     same generators, cut at the surface. With `warns` the function warns of defects of the mesh. With `spread` those in
     thin parts do not stay halfway between the walls. The first `held` generators are not moved; if it is None, all are
-    given, and move only where OpenFOAM would reject cells. With `targets` generators at walls settle; see `settled`.
+    given, and move only where OpenFOAM would reject cells. With `targets` those near walls move; see `settled`.
     """
     tell = engine.pool.on_work or (lambda _: None)
     tell("diagram of all cells")
