@@ -151,8 +151,9 @@ EXACT_PENALTY, EXACT_TOLERANCE, EXACT_ITERATIONS = 1e-2, 0.1, 30
 """Penalty of the first exact projections in boxes in 2D, and limits of all. Each projection starts from the solution of
 the last, and what a solve leaves is no more than the error of the linearization."""
 EXACT_PENALTY_PER_ERROR, MET_ERROR = 4.0, 1e-3
-"""Least penalty of exact projections in polygons and solids, for each mean |log(L / h)| above the second number: cells
-pass through narrow parts of polygons where they have too few on one side, and no mesh of a solid may have the sizes."""
+"""In polygons and solids the penalty of exact projections is at least the first number times what the mean |log(L / h)|
+exceeds the second by. Cells have to pass through narrow parts of a polygon, and a solid may have no mesh of the sizes:
+with a smaller penalty cells lose their shape."""
 NEWTON_PENALTY, NEWTON_ITERATIONS_3D, NEWTON_TOLERANCES_3D = 1e-3, 45, (0.1, 0.03, 0.03)
 """Penalty of Newton's steps, the last exact projections, and their limits in 3D."""
 PROJECT_STEPS, NEWTON_STEPS = 3, 3

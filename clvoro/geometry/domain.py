@@ -444,6 +444,10 @@ class Domain(ClipBox):
         x = np.where(corners, upper, lower)
         return Edges(x[order], x[(order + 1) % 4])
 
+    def crease_edges(self, walls: Walls | None = None, *, concave: bool | None = None) -> Edges:
+        """Raise an `InputError`: solids have creases; see `Solid.crease_edges`."""
+        raise InputError(f"{self} has no creases, expected a solid")
+
     def _checked_names(self) -> dict[str, list[int]] | None:
         """Check the caller's names, and return them with the numbers of their walls; None without names."""
         parts = self.boundaries

@@ -582,7 +582,10 @@ def _point(result: Result, through: ArrayLike | None) -> np.ndarray:
 
 
 def _corner(result: Result, through: ArrayLike | None, angles: tuple[float, float]) -> np.ndarray:
-    """Return the corner of a removed octant: where cells are few across the domain, behind all of them."""
+    """Return the corner of the octant that a view leaves out: `through`, or a point among the smallest cells.
+
+    Along axes on which the domain is less than two cells thick, it lies behind all cells.
+    """
     point, domain = _point(result, through), result.diagram.domain
     if through is not None:
         return point

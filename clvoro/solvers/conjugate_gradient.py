@@ -19,7 +19,8 @@ from .linear_system import BreakdownError, Limits, Operator, Precondition, Solut
 CURVATURE, _GAMMA, _ROWS = 3, 6, 12
 _SUM_B, _MAX_B, _NORM_B, _NORM_R, _SUM_R, _START, _SUM_X = 0, 1, 2, 4, 8, 10, 11
 _ALONG, _LENGTH = _SUM_B, _START
-"""Rows of (r, q) and (q, q), q = A p, with other parts; these rows are free after the start."""
+"""Rows of the sums (r, q) and (q, q), where q = A p. Only runs in parts need them; what these rows hold at the start is
+not needed any more."""
 RECORD_NORM, RECORD_RUNNING, RECORD_CURVATURE = 0, 2, 3
 _STATE = 8
 _FIRST_READ = 32

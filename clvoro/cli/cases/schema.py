@@ -163,8 +163,6 @@ class CreasesShape(Kind, tag="creases"):
     concave: bool | None = None
 
     def build(self, folder: Path, domain: Any = None) -> Any:
-        if not isinstance(domain, Solid):
-            raise InputError(f"size.shapes has creases, expected a solid as the domain in place of {domain}")
         return domain.crease_edges(self.edges, concave=self.concave)
 
 

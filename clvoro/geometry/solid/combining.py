@@ -63,7 +63,7 @@ def library() -> Any:
 
 
 def boolean(operation: str, *parts: NamedTriangles, simpler: float = 0.0) -> NamedTriangles:
-    """Return the surface of the sum (+) or common part (^) of solids, or of the first without the others (-).
+    """Return the surface of a boolean of solids: their sum (+), common part (^), or the first without the others (-).
 
     Triangles become fewer where the surface moves by less than the distance `simpler`.
 
