@@ -496,3 +496,19 @@ def test_generators_at_walls_settle(ctx, monkeypatch, first):
     assert first or off < 0.7 * off_before
     monkeypatch.setattr("clvoro.finite_volumes.solid_walls.settling._WORSE", 0.0)
     assert np.array_equal(made(CellTargets(volumes, held, first))[0].points, x)
+
+
+@pytest.mark.parametrize(("enough", "meshes"), [((1, 180), 1), ((0.005, 180), 2), ((0.005, 0), 6), ((0, 180), 6)])
+def test_settling_stops_when_sizes_and_angles_are_good(ctx, monkeypatch, enough, meshes):
+    """Otherwise it makes a mesh before each of five steps, and one after them."""
+    monkeypatch.setattr("clvoro.finite_volumes.solid_walls.settling._ENOUGH", enough)
+    solid = clvoro.Solid.box((0, 0, 0), (1, 1, 1))
+    x, h = generators(solid), np.full(64, H)
+    count = itertools.count()
+
+    def whole(points):
+        next(count)
+        return whole_faces(ctx, solid, points, h=h)
+
+    solid_diagram(WallSurface(solid), x, h, whole, targets=CellTargets(h**3))
+    assert next(count) == meshes

@@ -9,10 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import scipy
 
+from ...connectivity import used_indices
 from ...mesh.faces import Faces
 from .mend import with_neighbors
 from .wall_surface import WallSurface
@@ -21,7 +23,9 @@ _STEPS, _MOST = 5, 25_000
 """Largest number of steps, and largest product of the number of steps and that of cells: each step makes a mesh of all
 cells, and of many cells few are at walls."""
 _EXACT_STEPS, _LEAST = 12, 2
-"""Largest and least number of steps by the exact method."""
+"""Largest number of steps by the exact method, and that of many cells."""
+_ENOUGH, _EXACT_ENOUGH = (0.0015, 2.0), (0.0008, 2.0)
+"""No further step follows if mean size error and mean angle of faces, in degrees, are at most these near walls."""
 _FEW = 0.03
 """No generator settles if more than this share of them has a face that is more oblique or skewed than wanted."""
 _CHECKS = 6
@@ -73,6 +77,35 @@ class MadeCells:
         found[self.generator[with_neighbors(self.faces, near & rows[self.generator], rings) & near]] = True
         return found
 
+    def sums(self, values: np.ndarray) -> np.ndarray:
+        """Return the sum of `values` (m,) of the cells of each generator, (n,) float."""
+        return np.bincount(self.generator + 1, values, len(self.worst) + 1)[1:]
+
+    @cached_property
+    def volumes(self) -> np.ndarray:
+        """The volume that each generator has here, (n,) float; 0 if it has none."""
+        return self.sums(self.faces.measures.geometry.volumes)
+
+    @cached_property
+    def pairs(self) -> np.ndarray:
+        """Faces between cells of different generators, (k,) int."""
+        one, other = self.generators
+        return np.flatnonzero((one != other) & (one >= 0) & (other >= 0))
+
+    @property
+    def generators(self) -> tuple[np.ndarray, np.ndarray]:
+        """The generators on both sides of inner faces, (f,) int each."""
+        inner = slice(self.faces.n_inner)
+        return self.generator[self.faces.owner[inner]], self.generator[self.faces.neighbor[inner]]
+
+    def are_enough(self, targets: CellTargets) -> bool:
+        """Return whether sizes and angles are good enough without further steps."""
+        most_error, most_angle = _EXACT_ENOUGH if targets.first else _ENOUGH
+        here = self.volumes > 0
+        error = np.abs(np.cbrt(self.volumes[here] / targets.volumes[here]) - 1)
+        angle = self.faces.measures.non_orthogonality[self.pairs]
+        return not len(angle) or bool(error.mean() <= most_error and angle.mean() <= most_angle)
+
 
 def settled(
     surface: WallSurface,
@@ -105,7 +138,7 @@ def settled(
         worse = made.worst > most
         if not worse.any():
             good = points
-            if step >= steps:
+            if step >= steps or made.are_enough(targets):
                 break
         back = made.around(worse, max(step - steps, 1))
         stays |= back
@@ -128,26 +161,34 @@ def _step(
     The second ones are a damped least-squares solution of the linearized volumes. The cell of x grows by
     A (y - c) . dy / |y - x| where its neighbor y moves by dy; A and c are area and centroid of the face between them.
     """
-    f, g, n = made.faces, made.faces.measures.geometry, len(points)
-    volumes = np.bincount(made.generator + 1, g.volumes, n + 1)[1:]
-    moments = (np.bincount(made.generator + 1, g.volumes * c, n + 1)[1:] for c in g.centroids.T)
+    f, n, volumes = made.faces, len(points), made.volumes
+    g = f.measures.geometry
     free = ~stays & (volumes > 0)
     to_centroid = np.zeros((n, 3))
-    to_centroid[free] = np.stack(list(moments), axis=1)[free] / volumes[free, None] - points[free]
-    one, other = made.generator[f.owner[: f.n_inner]], made.generator[f.neighbor[: f.n_inner]]
-    between = np.flatnonzero((one != other) & (one >= 0) & (other >= 0))
-    one, other, center = one[between], other[between], f.center[between]
+    moments = np.stack([made.sums(g.volumes * c) for c in g.centroids.T], axis=1)
+    to_centroid[free] = moments[free] / volumes[free, None] - points[free]
+    between = made.pairs
+    one, other, center = *(rows[between] for rows in made.generators), f.center[between]
     scaled = f.area[between] / np.maximum(np.linalg.norm(points[other] - points[one], axis=1), 1e-3 * sizes[one])
     by_one, by_other = (scaled[:, None] * (points[c] - center) for c in (one, other))
     rows, columns = np.concatenate([one, one, other, other]), np.concatenate([other, one, one, other])
-    entries = np.concatenate([by_other, -by_one, by_one, -by_other]) * free[columns, None]
-    cells = np.flatnonzero(volumes > 0)
+    entries = np.concatenate([by_other, -by_one, by_one, -by_other])
     weight = np.where(free | targets.first, 1.0, _STAYING) / sizes**2
-    places = (np.repeat(rows, 3), (3 * columns[:, None] + np.arange(3)).ravel())
-    matrix = scipy.sparse.csr_matrix(((weight[rows, None] * entries).ravel(), places), shape=(n, 3 * n))[cells]
-    lack = (weight * (targets.volumes - volumes))[cells] - matrix @ to_centroid.ravel()
+    # Only generators that are free move, and only their cells and those beside them change.
+    kept = free[columns]
+    rows, columns, entries = rows[kept], columns[kept], entries[kept] * weight[rows[kept], None]
+    cells, rows = used_indices(rows, n)
+    movable = np.flatnonzero(free)
+    if not len(movable):
+        return to_centroid
+    columns = 3 * np.searchsorted(movable, columns)[:, None] + np.arange(3)
+    matrix = scipy.sparse.csr_matrix(
+        (entries.ravel(), (np.repeat(rows, 3), columns.ravel())), shape=(len(cells), 3 * len(movable))
+    )
+    lack = (weight * (targets.volumes - volumes))[cells] - matrix @ to_centroid[movable].ravel()
     damping = _EXACT_DAMPING if targets.first else _DAMPING
-    way = to_centroid + scipy.sparse.linalg.lsqr(matrix, lack, damp=damping, iter_lim=60)[0].reshape(n, 3)
+    way = to_centroid
+    way[movable] += scipy.sparse.linalg.lsqr(matrix, lack, damp=damping, iter_lim=60)[0].reshape(-1, 3)
     way *= np.minimum(1, _LONGEST * sizes / np.maximum(np.linalg.norm(way, axis=1), 1e-300))[:, None]
     moved = np.flatnonzero(way.any(axis=1))
     there, h = points[moved] + way[moved], sizes[moved]
