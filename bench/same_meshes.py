@@ -235,8 +235,8 @@ def size_cases() -> Iterator[Case]:
         "scattered": sizing.Scattered(rng.random((300, 2)), 0.03 + 0.02 * rng.random(300), (0, 0), (1, 1)),
         "callable": lambda p: 0.02 + 0.05 * p[:, 0],
         "minimum": sizing.minimum(raster, lambda p: 0.02 + 0.05 * p[:, 1]),
-        "hessian": sizing.hessian_size(front, (0, 0), (1, 1), n_cells=1000),
-        "gradient": sizing.gradient_size(front, (0, 0), (1, 1), n_cells=1000, h_max=0.1),
+        "hessian": sizing.hessian_size(sizing.Raster(front, (0, 0), (1, 1)), n_cells=1000),
+        "gradient": sizing.gradient_size(sizing.Raster(front, (0, 0), (1, 1)), n_cells=1000, h_max=0.1),
     }
     for kind, field in fields.items():
         yield Case(f"size, {kind}", adapted(SQUARE, field, effort="fast"))

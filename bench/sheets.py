@@ -89,9 +89,9 @@ def from_solution(kind: str) -> Example:
     along = np.linspace(0, 1.5, 200)
     layer = np.column_stack([along, wave(along)])
     if kind == "hessian":
-        size = sizing.hessian_size(values, BOX.lower, BOX.upper, n_cells=1100, h_max=0.12)
+        size = sizing.hessian_size(sizing.Raster(values, BOX.lower, BOX.upper), n_cells=1100, h_max=0.12)
         return Example("Graded(hessian_size(u, ...), growth=1.3)", sizing.Graded(size, growth=1.3), dashed=[layer])
-    size = sizing.gradient_size(values, BOX.lower, BOX.upper, eps=0.45, h_max=0.12)
+    size = sizing.gradient_size(sizing.Raster(values, BOX.lower, BOX.upper), eps=0.45, h_max=0.12)
     return Example("Graded(gradient_size(u, ...), growth=1.2)", sizing.Graded(size, growth=1.2), dashed=[layer])
 
 

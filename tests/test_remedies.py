@@ -57,6 +57,7 @@ RECORDS = np.array([(0.5, 0.2), (0.1, 0.3)], dtype=[("x", float), ("y", float)])
 WKT = "POLYGON ((0 0, 1 0, 1 1, 0 0))"
 LAKE = {"type": "Polygon", "coordinates": [[*SQUARE, SQUARE[0]]]}
 GRID = np.random.default_rng(0).random((9, 9))
+SOLUTION = sizing.Raster(GRID, (0, 0), (1, 1))
 TWICE = np.concatenate([POINTS, POINTS[:1]])
 DISTANCE = sizing.Distance(sizing.Circle((0.5, 0.5), 0.2), h_min=0.1, growth=1.2)
 CASE = "size = 0.3\n[domain]\nlower = [0, 0]\nupper = [1, 1]\n[run]\neffort = 'fast'\n"
@@ -449,17 +450,17 @@ ROWS = [
         lambda t: sizing.Region(shapely.Polygon(SQUARE), 0.1, 1.2),
     ),
     (
-        lambda t: sizing.hessian_size(np.ones((2, 2)), (0, 0), (1, 1), n_cells=9),
-        lambda t: sizing.hessian_size(GRID, (0, 0), (1, 1), n_cells=9),
+        lambda t: sizing.hessian_size(sizing.Raster(np.ones((2, 2)), (0, 0), (1, 1)), n_cells=9),
+        lambda t: sizing.hessian_size(SOLUTION, n_cells=9),
     ),
     (
-        lambda t: sizing.hessian_size(GRID, (0, 0), (1, 1), n_cells=9, p=0),
-        lambda t: sizing.hessian_size(GRID, (0, 0), (1, 1), n_cells=9, p=np.inf),
+        lambda t: sizing.hessian_size(SOLUTION, n_cells=9, p=0),
+        lambda t: sizing.hessian_size(SOLUTION, n_cells=9, p=np.inf),
     ),
-    (lambda t: sizing.hessian_size(np.ones((9, 9)), (0, 0), (1, 1), n_cells=9), lambda t: t.run(BOX, 0.3)),
+    (lambda t: sizing.hessian_size(SOLUTION.with_values(np.ones((9, 9))), n_cells=9), lambda t: t.run(BOX, 0.3)),
     (
-        lambda t: sizing.hessian_size(GRID, (0, 0), (1, 1), n_cells=9, h_max=1e-3),
-        lambda t: sizing.hessian_size(GRID, (0, 0), (1, 1), n_cells=9),
+        lambda t: sizing.hessian_size(SOLUTION, n_cells=9, h_max=1e-3),
+        lambda t: sizing.hessian_size(SOLUTION, n_cells=9),
     ),
     # Boxes, polygons and curves.
     (lambda t: clvoro.Box(0, 2.5), lambda t: clvoro.Box((0, 0), (2.5, 1.5))),
@@ -888,12 +889,12 @@ ROWS = [
         lambda t: sizing.interface_distance(POINTS[:, 0] - 0.5, on=t.mesh),
     ),
     (
-        lambda t: sizing.hessian_size(POINTS[:, 0] ** 2, (0, 0), (1, 1), n_cells=9, on=t.mesh),
+        lambda t: sizing.hessian_size(POINTS[:, 0] ** 2, n_cells=9),
         lambda t: sizing.hessian_size(POINTS[:, 0] ** 2, n_cells=9, on=t.mesh),
     ),
     (
-        lambda t: sizing.hessian_size(GRID**4, (0, 0), (1, 1), n_cells=9, growth=1.1),
-        lambda t: sizing.Graded(sizing.hessian_size(GRID**4, (0, 0), (1, 1), n_cells=9), 1.1),
+        lambda t: sizing.hessian_size(SOLUTION, n_cells=9, growth=1.1),
+        lambda t: sizing.Graded(sizing.hessian_size(SOLUTION, n_cells=9), 1.1),
     ),
     (
         lambda t: sizing.gradient_size(np.ones(30), on=t.mesh, eps=0.1),

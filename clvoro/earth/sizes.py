@@ -176,7 +176,7 @@ def _on_sphere(raster: Raster) -> tuple[Raster, float]:
         raise InputError(
             f"{raster!r} goes once around the sphere in radians, expected degrees: use numpy.degrees for its corners"
         )
-    spacing = (high[0] - low[0]) / max(count - (raster.at == "nodes"), 1)
+    spacing = raster.spacing[0]
     nodes = low[0] + spacing * (np.arange(count) + 0.5 * (raster.at == "centers"))
     around = nodes[-1] - nodes[0] + spacing >= _GLOBAL
     west = low[0] if around else (low[0] + high[0]) / 2 - 180

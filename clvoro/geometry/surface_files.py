@@ -92,7 +92,7 @@ def read_parts(path: FilePath | Sequence[FilePath], kinds: Iterable[str] = SURFA
             f"{str(path)!r} cannot be read as {kind.upper()} ({type(error).__name__}: {error}); export it again"
         ) from error
     if not any(len(part.triangles) for part in parts):
-        raise InputError(f"{str(path)!r} holds no triangles, expected a surface")
+        raise InputError(f"{str(path)!r} holds no triangles, or is cut short, expected a surface")
     return parts
 
 

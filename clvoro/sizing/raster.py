@@ -226,10 +226,14 @@ class Raster(Field):
         self.outside = outside
         low, high = check_box("Raster", np.shape(values), lower, upper, at)
         counts = np.array(np.shape(values)[::-1])
-        spacing = (high - low) / np.maximum(counts - (at == "nodes"), 1)
-        self.values = fill_missing("Raster values", values, missing, spacing)
+        self.spacing = (high - low) / np.maximum(counts - (at == "nodes"), 1)
+        self.values = fill_missing("Raster values", values, missing, self.spacing)
         self.lower, self.upper, self.at = low, high, at
         self.dim = self.values.ndim
+
+    def with_values(self, values: np.ndarray) -> Raster:
+        """Return the raster of other values at the same places."""
+        return Raster(values, self.lower, self.upper, self.at, outside=self.outside)
 
     @property
     def _counts(self) -> np.ndarray:
@@ -266,11 +270,10 @@ class Raster(Field):
         if self.outside is not None:
             return []
         many = self._counts >= _MANY
-        spacing = (self.upper - self.lower) / np.maximum(self._counts - (self.at == "nodes"), 1)
-        if many.all() and (domain.extent < _WITHIN * spacing).all():
+        if many.all() and (domain.extent < _WITHIN * self.spacing).all():
             return [
                 f"the domain, {domain.extent.tolist()} across, lies between two values of {self!r}, which are "
-                f"{spacing.tolist()} apart, so that sizes barely vary; do raster and domain have the same unit?"
+                f"{self.spacing.tolist()} apart, so that sizes barely vary; do raster and domain have the same unit?"
             ]
         return self._coverage_warnings(domain)
 

@@ -137,10 +137,10 @@ def test_sizes_from_a_solution(tmp_path):
     u = np.tanh(5 * np.linspace(-1, 1, 81)) + np.zeros((41, 1))
     np.save(tmp_path / "u.npy", u)
     text = "[size]\nkind = 'hessian'\nfile = 'u.npy'\nn_cells = 500\nh_max = 0.2"
-    wanted = sizing.hessian_size(u, (0, 0), (2, 1), n_cells=500, h_max=0.2)
+    wanted = sizing.hessian_size(sizing.Raster(u, (0, 0), (2, 1)), n_cells=500, h_max=0.2)
     assert field(text, tmp_path)(points()) == pytest.approx(wanted(points()))
     text = "[size]\nkind = 'gradient'\nfile = 'u.npy'\neps = 0.1\nh_max = 0.2"
-    wanted = sizing.gradient_size(u, (0, 0), (2, 1), eps=0.1, h_max=0.2)
+    wanted = sizing.gradient_size(sizing.Raster(u, (0, 0), (2, 1)), eps=0.1, h_max=0.2)
     assert field(text, tmp_path)(points()) == pytest.approx(wanted(points()))
 
 

@@ -285,6 +285,9 @@ def test_combinations_and_numbers(fine):
     assert all(window([(at, 0.5)]) < 1.3 * e([(at, 0.5)]) for at, e in ((0.3, left), (0.6, later)))
 
 
+GRID = sizing.Raster(np.ones((4, 4)), (0, 0), (1, 1))
+
+
 @pytest.mark.parametrize(
     ("call", "kind", "text"),
     [
@@ -300,9 +303,9 @@ def test_combinations_and_numbers(fine):
         ),
         (lambda m: sizing.hessian_size(m.centroids[:, 0], on=m, n_cells=50), InputError, "are 0 everywhere"),
         (lambda m: sizing.hessian_size(np.ones(len(m)), on=m), InputError, "exactly one"),
-        (lambda m: sizing.hessian_size(np.ones(len(m)), (0, 0), (1, 1), on=m, eps=1), InputError, "for rasters"),
-        (lambda m: sizing.hessian_size(np.ones((4, 4)), n_cells=9), InputError, "on=mesh"),
-        (lambda m: sizing.hessian_size(np.ones((4, 4)), (0, 0), (1, 1), n_cells=9, growth=1.1), InputError, "Graded"),
+        (lambda m: sizing.hessian_size(GRID, on=m, eps=1), InputTypeError, "values"),
+        (lambda m: sizing.hessian_size(np.ones((4, 4)), n_cells=9), InputTypeError, "on=mesh"),
+        (lambda m: sizing.hessian_size(GRID, n_cells=9, growth=1.1), InputError, "Graded"),
         (lambda m: sizing.hessian_size([], on=m, eps=1), InputError, "a row for each"),
         (lambda m: sizing.hessian_size(m.points[:, 0], on=m, eps=1, weight=-np.ones(len(m))), InputError, "absolute"),
         (lambda m: sizing.hessian_size(m.points[:, 0] ** 2, on=m, n_cells=9, h_max=0.01), InputError, "change h_min"),

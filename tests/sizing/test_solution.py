@@ -9,6 +9,7 @@ from scipy.spatial import cKDTree
 from clvoro import Box, sizing
 from clvoro.errors import InputError, InputTypeError
 from clvoro.opencl.engine import Engine
+from clvoro.sizing import Raster
 
 
 def grid(lower, upper, counts):
@@ -30,6 +31,7 @@ def node_weights(lower, upper, counts):
 
 LOWER, UPPER = (1.0, -2.0, 0.5), (3.0, -1.0, 1.1)
 COUNTS = (41, 31, 13)
+FLAT = Raster(np.ones((3, 3)), (0, 0), (1, 1))
 
 
 @pytest.mark.sparse(3)
@@ -40,12 +42,12 @@ def test_a_parabola_gets_equal_cells(d, p):
     lower, upper, counts = LOWER[:d], UPPER[:d], COUNTS[:d]
     x = grid(lower, upper, counts)
     u = 3 * x[0] ** 2 - 5 * x[1] ** 2 + 2 * x[0] * x[1] + x[-1]
-    size = sizing.hessian_size(u, lower, upper, n_cells=777, p=p)
+    size = sizing.hessian_size(Raster(u, lower, upper), n_cells=777, p=p)
     volume = np.prod(np.subtract(upper, lower))
     assert size.values == pytest.approx((volume / 777) ** (1 / d), rel=1e-9)
     # |H| = 5.8...: the largest absolute eigenvalue of [[6, 2], [2, -10]].
     largest = np.abs(np.linalg.eigvalsh([[6, 2], [2, -10]])).max()
-    size = sizing.hessian_size(u, lower, upper, eps=1e-3, p=p)
+    size = sizing.hessian_size(Raster(u, lower, upper), eps=1e-3, p=p)
     # e = h^2 l / 8 everywhere, so its norm is e volume^(1/p).
     e = 1e-3 / (1 if math.isinf(p) else volume ** (1 / p))
     assert size.values == pytest.approx(math.sqrt(8 * e / largest), rel=1e-9)
@@ -58,7 +60,7 @@ def test_sizes_follow_the_formula(d, p):
     """u = cosh(3 x) has l = 9 cosh(3 x) up to the error of second differences."""
     lower, upper, counts = (0, 0, 0)[:d], (1, 1, 1)[:d], (201, 7, 5)[:d]
     x = grid(lower, upper, counts)
-    size = sizing.hessian_size(np.cosh(3 * x[0]), lower, upper, n_cells=5000, p=p)
+    size = sizing.hessian_size(Raster(np.cosh(3 * x[0]), lower, upper), n_cells=5000, p=p)
     curved = 9 * np.cosh(3 * x[0])
     w = node_weights(lower, upper, counts)
     power = p / (2 * p + d)
@@ -78,7 +80,7 @@ def test_sizes_are_optimal_for_their_number(p):
     second = np.diff(u, 2, axis=1)
     curved = np.abs(np.pad(second, ((0, 0), (1, 1)), mode="edge")) * 30**2
     w = node_weights(lower, upper, counts)
-    h = sizing.hessian_size(u, lower, upper, n_cells=3000, p=p, h_max=1e3).values
+    h = sizing.hessian_size(Raster(u, lower, upper), n_cells=3000, p=p, h_max=1e3).values
 
     def norm(h):
         return np.sum(w * (h**2 * curved) ** p) ** (1 / p)
@@ -98,7 +100,7 @@ def test_front_is_interpolated_better_than_by_equal_cells():
     """The interpolation error e = h^2 |u''| / 8 of a tanh layer: its mean over the domain."""
     x, y = grid((0, 0), (1, 1), (401, 401))
     u = np.tanh(60 * (x + 0.5 * y - 0.75))
-    size = sizing.hessian_size(u, (0, 0), (1, 1), n_cells=4000, p=1, h_max=0.1)
+    size = sizing.hessian_size(Raster(u, (0, 0), (1, 1)), n_cells=4000, p=1, h_max=0.1)
     t = 60 * (x + 0.5 * y - 0.75)
     curved = 1.25 * 60**2 * np.abs(2 * np.tanh(t) / np.cosh(t) ** 2)
     w = node_weights((0, 0), (1, 1), (401, 401))
@@ -109,25 +111,25 @@ def test_bounds_keep_the_number_of_cells():
     x, y = grid((0, 0), (1, 1), (101, 81))
     u = np.tanh(30 * (x - 0.5)) + 0.01 * y**2
     options = {"h_min": 0.01, "h_max": 0.05}
-    size = sizing.hessian_size(u, (0, 0), (1, 1), n_cells=2000, **options)
+    size = sizing.hessian_size(Raster(u, (0, 0), (1, 1)), n_cells=2000, **options)
     assert (size.values.min(), size.values.max()) == (0.01, 0.05)
     w = node_weights((0, 0), (1, 1), (101, 81))
     assert np.sum(w / size.values**2) == pytest.approx(2000, rel=1e-9)
     with pytest.raises(InputError, match="400 to 10000 cells; change h_min, h_max or n_cells"):
-        sizing.hessian_size(u, (0, 0), (1, 1), n_cells=300, **options)
-    pixels = sizing.hessian_size(u, (0, 0), (1, 1), n_cells=2000, at="centers", **options)
+        sizing.hessian_size(Raster(u, (0, 0), (1, 1)), n_cells=300, **options)
+    pixels = sizing.hessian_size(Raster(u, (0, 0), (1, 1), at="centers"), n_cells=2000, **options)
     assert np.mean(1 / pixels.values**2) == pytest.approx(2000, rel=1e-9)
 
 
 def test_gradient_size_gives_a_constant_change_per_cell():
     x, y = grid((0, 0), (2, 1), (81, 41))
-    size = sizing.gradient_size(3 * x + 4 * y, (0, 0), (2, 1), eps=0.1)
+    size = sizing.gradient_size(Raster(3 * x + 4 * y, (0, 0), (2, 1)), eps=0.1)
     assert size.values == pytest.approx(0.1 / 5)
-    size = sizing.gradient_size(x * x, (0, 0), (2, 1), eps=0.1, h_min=0.04, h_max=0.2)
+    size = sizing.gradient_size(Raster(x * x, (0, 0), (2, 1)), eps=0.1, h_min=0.04, h_max=0.2)
     # The derivative of x^2 is exact inside, and by half a step off at the sides.
     expected = np.clip(0.1 / np.maximum(2 * x, 1e-9), 0.04, 0.2)
     assert size.values[:, 1:-1] == pytest.approx(expected[:, 1:-1])
-    counted = sizing.gradient_size(np.cosh(x) + y, (0, 0), (2, 1), n_cells=900)
+    counted = sizing.gradient_size(Raster(np.cosh(x) + y, (0, 0), (2, 1)), n_cells=900)
     w = node_weights((0, 0), (2, 1), (81, 41))
     assert np.sum(w / counted.values**2) == pytest.approx(900, rel=1e-9)
 
@@ -135,18 +137,18 @@ def test_gradient_size_gives_a_constant_change_per_cell():
 def test_constant_solutions_give_h_max():
     flat = np.ones((5, 6))
     with pytest.raises(InputError, match=r"eps=0.1 gives no size; give h_max"):
-        sizing.hessian_size(flat, (0, 0), (3, 1), eps=0.1)
-    assert sizing.gradient_size(flat, (0, 0), (3, 1), eps=0.1, h_max=0.5).values.max() == 0.5
+        sizing.hessian_size(Raster(flat, (0, 0), (3, 1)), eps=0.1)
+    assert sizing.gradient_size(Raster(flat, (0, 0), (3, 1)), eps=0.1, h_max=0.5).values.max() == 0.5
     with pytest.raises(InputError, match=r"are 0 everywhere.*use a number"):
-        sizing.hessian_size(flat, (0, 0), (3, 1), n_cells=100)
+        sizing.hessian_size(Raster(flat, (0, 0), (3, 1)), n_cells=100)
 
 
 @pytest.mark.parametrize("scale", [1e-120, 1e120])
 def test_units_do_not_matter(scale):
     x, y = grid((0, 0), (1, 1), (31, 31))
     u = np.sin(5 * x) * y
-    plain = sizing.hessian_size(u, (0, 0), (1, 1), n_cells=500).values
-    assert sizing.hessian_size(u * scale, (0, 0), (1, 1), n_cells=500).values == pytest.approx(plain)
+    plain = sizing.hessian_size(Raster(u, (0, 0), (1, 1)), n_cells=500).values
+    assert sizing.hessian_size(Raster(u * scale, (0, 0), (1, 1)), n_cells=500).values == pytest.approx(plain)
 
 
 def test_on_the_device(ctx):
@@ -154,7 +156,7 @@ def test_on_the_device(ctx):
 
     engine = Engine(ctx, cl.CommandQueue(ctx), 2, np.dtype("float32"))
     x, y = grid((0, 0), (1, 1), (65, 65))
-    size = sizing.hessian_size(np.tanh(9 * (x - y)), (0, 0), (1, 1), n_cells=500, h_max=0.2)
+    size = sizing.hessian_size(Raster(np.tanh(9 * (x - y)), (0, 0), (1, 1)), n_cells=500, h_max=0.2)
     stage = sizing.Sizing(engine, Box((0, 0), (1, 1)), size)
     points = np.random.default_rng(2).random((100, 2))
     assert stage(points) == pytest.approx(size(points), rel=1e-5)
@@ -171,7 +173,7 @@ def test_gaps_are_filled_with_the_nearest_value(shape):
     gaps = rng.random(shape) < 0.6
     holed = np.where(gaps, np.nan, values)
     upper = spacing * (np.array(shape[::-1]) - 1)
-    found = sizing.Raster(holed, (0,) * len(shape), upper, missing="nearest").values
+    found = Raster(holed, (0,) * len(shape), upper, missing="nearest").values
     assert np.array_equal(found[~gaps], values[~gaps])
     places = np.argwhere(np.ones(shape, bool)) * spacing[::-1]
     known = ~gaps.ravel()
@@ -180,9 +182,9 @@ def test_gaps_are_filled_with_the_nearest_value(shape):
         away = np.linalg.norm(places[known] - place, axis=1)
         assert value in values.ravel()[known][away <= near * (1 + 1e-12)]
     masked = np.ma.masked_array(values, gaps)
-    assert np.array_equal(sizing.Raster(masked, (0,) * len(shape), upper, missing="nearest").values, found)
-    u = sizing.hessian_size(holed, (0,) * len(shape), upper, eps=0.1, missing="nearest")
-    v = sizing.hessian_size(found, (0,) * len(shape), upper, eps=0.1)
+    assert np.array_equal(Raster(masked, (0,) * len(shape), upper, missing="nearest").values, found)
+    u = sizing.hessian_size(Raster(holed, (0,) * len(shape), upper, missing="nearest"), eps=0.1)
+    v = sizing.hessian_size(Raster(found, (0,) * len(shape), upper), eps=0.1)
     assert np.array_equal(u.values, v.values)
 
 
@@ -220,24 +222,21 @@ def test_default_resolution_follows_the_points():
     ("make", "error", "message"),
     [
         (
-            lambda: sizing.Raster([[1, np.nan], [np.nan, 2]], (0, 0), (1, 1)),
+            lambda: Raster([[1, np.nan], [np.nan, 2]], (0, 0), (1, 1)),
             InputError,
             r"\[0, 1\] is nan.*2 of 4 are missing.*missing='nearest'",
         ),
-        (lambda: sizing.Raster([[np.nan]], (0, 0), (1, 1), missing="nearest"), InputError, "all missing"),
-        (lambda: sizing.Raster([[1, np.inf]], (0, 0), (1, 1), missing="nearest"), InputError, r"\[0, 1\] is inf"),
-        (lambda: sizing.Raster([[1]], (0, 0), (1, 1), missing="zero"), InputError, "'nearest'"),
-        (lambda: sizing.hessian_size(np.ones((3, 3)), (0, 0), (1, 1)), InputError, "exactly one"),
-        (lambda: sizing.hessian_size(np.ones((2, 3)), (0, 0), (1, 1), eps=1), InputError, "at least 3"),
-        (lambda: sizing.hessian_size(np.ones((3, 3)), (0, 0), (1, 1), eps=1, p=0.5), InputError, "at least 1"),
-        (lambda: sizing.hessian_size(np.ones((3, 3)), (0, 0), (1, 1), eps=0), InputError, "hessian_size eps"),
-        (
-            lambda: sizing.gradient_size(np.ones((3, 3)), (0, 0), (1, 1), eps=1, h_min=2, h_max=1),
-            InputError,
-            "h_min <= h_max",
-        ),
-        (lambda: sizing.gradient_size(np.ones((3, 3)), (0, 0), (1, 0), eps=1), InputError, "gradient_size got lower"),
-        (lambda: sizing.gradient_size("ab", (0, 0), (1, 1), eps=1), InputError, "shape"),
+        (lambda: Raster([[np.nan]], (0, 0), (1, 1), missing="nearest"), InputError, "all missing"),
+        (lambda: Raster([[1, np.inf]], (0, 0), (1, 1), missing="nearest"), InputError, r"\[0, 1\] is inf"),
+        (lambda: Raster([[1]], (0, 0), (1, 1), missing="zero"), InputError, "'nearest'"),
+        (lambda: sizing.hessian_size(FLAT), InputError, "exactly one"),
+        (lambda: sizing.hessian_size(Raster(np.ones((2, 3)), (0, 0), (1, 1)), eps=1), InputError, "at least 3"),
+        (lambda: sizing.hessian_size(FLAT, eps=1, p=0.5), InputError, "at least 1"),
+        (lambda: sizing.hessian_size(FLAT, eps=0), InputError, "hessian_size eps"),
+        (lambda: sizing.gradient_size(FLAT, eps=1, h_min=2, h_max=1), InputError, "h_min <= h_max"),
+        (lambda: Raster(np.ones((3, 3)), (0, 0), (1, 0)), InputError, "Raster got lower"),
+        (lambda: Raster("ab", (0, 0), (1, 1)), InputError, "shape"),
+        (lambda: sizing.gradient_size(np.ones((3, 3)), eps=1), InputTypeError, r"gradient_size\(Raster\(values"),
         (lambda: sizing.Scattered([(0, 0)], [1]), InputError, "pass lower and upper"),
         (lambda: sizing.Scattered(np.zeros((0, 2)), []), InputError, "no points"),
         (lambda: sizing.Scattered([(0, 0), (1, 1)], [1, 2], (0, 0), (1, 1)), InputError, "method='nearest'"),

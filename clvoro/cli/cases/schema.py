@@ -308,13 +308,13 @@ class ArrayTable(Kind):
     missing: Literal["error", "nearest"] | None = None
 
     def over(self, domain: Domain, values: np.ndarray) -> Any:
-        """Return the size field of an array over `domain`, unless the table has other corners."""
+        """Return an array over `domain`, unless the table has other corners."""
         corners = self.lower or domain.lower, self.upper or domain.upper
-        return type(self).MAKE(values, *corners, **self.given("file", "lower", "upper"))
+        given = {key: value for key, value in self.given().items() if key in ("at", "missing", "outside")}
+        return sizing.Raster(values, *corners, **given)
 
 
 class RasterTable(ArrayTable, tag="raster"):
-    MAKE = sizing.Raster
     variable: Text | None = None
     outside: Literal["nearest", "error", "ignore"] | None = None
 
@@ -367,7 +367,8 @@ class Gradient(ArrayTable, tag="gradient"):
             raise InputError(f"size has {', '.join(sorted(unused))} {other} fields; {remedy}")
         if self.fields is None:
             _require(domain.map_domain is domain, self, _ON_SPHERE, domain)
-            return self.over(domain, load_array(folder / self.file, "size.file"))
+            solution = self.over(domain, load_array(folder / self.file, "size.file"))
+            return type(self).MAKE(solution, **self.given("file", *_OF_ARRAYS))
         mesh, values = read_fields(folder / self.file, self.fields, domain=domain, time=self.time)
         return type(self).MAKE(list(values.values()), on=mesh, **self.given("file", "fields", "time"))
 

@@ -15,6 +15,7 @@ SMOOTH, CONVEX, CONCAVE = 0, 1, 2
 _STRAIGHT = math.radians(1)  # a crease whose angle is at most this much less than 180 degrees counts as concave
 _SOFT = math.radians(60)  # borders of groups at which a wrap turns by less take the mean angle of all between the two
 _TURN = math.radians(50)  # a chain that turns by more than this at a vertex has a corner there
+_SAME_ANGLE = 1e-9  # angles of triangles around an edge that differ by less are the same
 
 
 @dataclass(frozen=True)
@@ -104,8 +105,13 @@ def _pair_around(vertices: np.ndarray, triangles: np.ndarray, sides: np.ndarray,
     u = third[0] - (third[0] @ axis) * axis
     u /= max(np.linalg.norm(u), 1e-300)
     angle = np.arctan2(third @ np.cross(axis, u), third @ u)
+    angle[angle < -_SAME_ANGLE] += 2 * math.pi
     # Around the edge, seen against its direction, the inside lies behind a forward side in the negative direction.
     order = np.lexsort((forward, angle))
+    for k in range(len(order) - 1):  # bodies that touch, and sheets: at one angle the inside begins and ends in turn
+        at, after = order[k : k + 2]
+        if angle[after] - angle[at] < _SAME_ANGLE and forward[at] == forward[order[k - 1]] != forward[after]:
+            order[k : k + 2] = after, at
     for k, at in enumerate(order):
         before = order[k - 1]
         if forward[at] and not forward[before]:

@@ -259,18 +259,14 @@ class Solid(Domain):
         """Return the solid inside of a ``trimesh.Trimesh``, or of all meshes of a ``trimesh.Scene`` and their names."""
         return cls._of(named_parts(parts_of(mesh)), options, "Solid")
 
-    @classmethod
-    def outside(
-        cls, of: Solid, box: Box | tuple[Sequence[float], Sequence[float]], **options: Unpack[SolidOptions]
-    ) -> Solid:
-        """Return the region of a box around a body, for external flow.
+    def outside(self, box: Box | tuple[Sequence[float], Sequence[float]], **options: Unpack[SolidOptions]) -> Solid:
+        """Return the region of a box around this body, for external flow.
 
         The sides of the box have the names xMin, xMax, ..., or those of a `Box`; the others are those of the body.
         Cavities of the body are not meshed. A body that touches or crosses the box needs manifold3d.
 
         Parameters
         ----------
-        of : Solid
         box : Box, or its lower and upper corner
         **options
             As for `Solid`.
@@ -283,14 +279,14 @@ class Solid(Domain):
         if isinstance(box, Box) and any(box.periodic):
             raise InputError(f"Solid.outside box is {box}, expected a box with walls; leave out `periodic`")
         lower, upper = (box.lower, box.upper) if isinstance(box, Box) else box
-        frame = cls.box(lower, upper, names=box.names if isinstance(box, Box) else None)
-        made = around(of, frame)
-        if of.angle >= 90:  # the edges of the box stay creases
+        frame = self.box(lower, upper, names=box.names if isinstance(box, Box) else None)
+        made = around(self, frame)
+        if self.angle >= 90:  # the edges of the box stay creases
             x, triangles = made.vertices, made.triangles
             on = np.isclose(np.hstack([x, x]), np.hstack([lower, upper]), rtol=0, atol=_ON * frame.extent.max())
             ends = np.stack([triangles, np.roll(triangles, -1, axis=1)], axis=2).reshape(-1, 2)
             options["creases"] = np.unique(np.sort(ends[on[ends].all(axis=1).sum(axis=1) > 1], axis=1), axis=0)
-        return cls._of(made, {"angle": of.angle, **options}, "Solid")
+        return self._of(made, {"angle": self.angle, **options}, "Solid")
 
     def __add__(self, other: Solid) -> Solid:
         return self._combined(other, "+")

@@ -34,7 +34,7 @@ vorticity = roll(x - 0.27, y - 0.3, 1) + roll(x - 0.72, y - 0.72, -1)
 # `hessian_size` makes the interpolation error small for 12,000 cells in each period. `Graded` limits the growth.
 
 wide = clvoro.Box((-0.5, -0.5), (1.5, 1.5))
-best = sizing.hessian_size(vorticity, wide.lower, wide.upper, n_cells=48000, h_min=0.003, h_max=0.05)
+best = sizing.hessian_size(sizing.Raster(vorticity, wide.lower, wide.upper), n_cells=48000, h_min=0.003, h_max=0.05)
 size = sizing.Graded(best, growth=1.2, box=wide)
 box = clvoro.Box((0, 0), (1, 1), periodic=True)
 mesh = clvoro.adapt(box, size)

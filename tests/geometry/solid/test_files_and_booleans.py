@@ -69,7 +69,7 @@ def test_the_outside_of_a_body_has_the_names_of_both():
     for option in ({"group_names": ["body"]}, {"name": "body"}):
         assert Solid.box((0, 0, 0), (1, 1, 1), **option).boundary_names == ("body",)
     body = Solid.ball((0, 0, 0), 1, edge=0.3, group_names=("ball",))
-    region = Solid.outside(body, Box((-2, -2, -2), (4, 2, 2), names={"inlet": "xMin"}))
+    region = body.outside(Box((-2, -2, -2), (4, 2, 2), names={"inlet": "xMin"}))
     assert region.boundary_names == ("inlet", "xMax", "yMin", "yMax", "zMin", "zMax", "ball")
     assert region.measure == pytest.approx(6 * 16 - body.measure)
     assert region.contains(np.array([(0, 0, 0), (1.5, 0, 0)])).tolist() == [False, True]
@@ -167,6 +167,7 @@ FIN = np.vstack([V, (2, 0.5, 0.5)])
         (np.vstack([V, TALL]), np.vstack([sides(V, 2), sides(TALL, 2) + 8]), "closed 2 flat holes", 0.75),
         (np.vstack([V, V + 0.5]), np.vstack([T, T + 8]), "united 2 parts", 1.875),
         (np.vstack([V, np.add(V, (1, 0, 0))]), np.vstack([T, T + 8]), "removed 4 duplicate", 2),
+        (np.vstack([V, V * (1, -1, 1) + (1, 1, 0)]), np.vstack([T, T[:, ::-1] + 8]), "united 2 parts", 2),
         (np.vstack([V, np.add(V, (1, 0.5, 0)), V + 3]), np.vstack([T, T + 8, T + 16]), "united 2 parts", 3),
     ],
 )
