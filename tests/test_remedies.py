@@ -1032,7 +1032,6 @@ TESTED_IN = {
     "longer than the surface": "geometry/solid/test_files_and_booleans.py::test_wrong_options_are_refused",
     "is drawn in a figure of its own": "geometry/test_boundary_names.py::test_plots_show_walls_in_space",
     "that of a mesh is mesh.domain": "geometry/test_boundary_names.py::test_plots_show_the_names",
-    "or the mesh on whose cells the values are": "sizing/test_estimates.py::test_bad_input_is_refused",
     "has one value in all cells of the latest time": "foam/test_foam_cases.py::test_bad_input_changes_nothing",
     "a mesh that the solver moves or refines": "foam/test_foam_cases.py::test_bad_input_changes_nothing",
     "which writes one for each patch": "foam/test_foam_cases.py::test_bad_input_changes_nothing",
