@@ -35,7 +35,7 @@ _SAMPLE = 1024  # points on walls at which sizes are averaged
 _INSIDE, _LEAST_RATIO = 1 << 14, 0.7  # points to measure volumes beside walls, least factor on sizes of cells
 INNER_DEPTH, DEEPER = 2.0, 8.0
 """Vertices move with a wall that gets layers if they are nearer to it than INNER_DEPTH h + DEEPER thickness."""
-OF_GAP = 0.15
+OF_GAP = 0.25
 """Share of the distance to the opposite wall that layers of prisms fill."""
 COARSER, FINER = 2.0, 1e-3
 """Size of the cells of layers over the size field above which a run warns, and their default width over it below which
@@ -93,7 +93,7 @@ class Layers:
 
     In a `Solid` the run meshes the whole solid. Then the polygons on the chosen patches move inwards by the thickness
     of all layers, inner vertices follow them over some cells, and prisms fill what is left free. Where a patch with
-    layers meets one without at about a right angle, the sides of the prisms lie on that patch. Layers fill at most 0.15
+    layers meets one without at about a right angle, the sides of the prisms lie on that patch. Layers fill at most 0.25
     of a gap from each side, taper to nothing at other borders and at sharp edges, and are thinner where cells would be
     invalid: a warning says where, and ``settings["thickness"]`` of the result how thick they are. `n_cells` counts the
     cells without prisms, and `Adapter.memory_needed`, the memory of the device, does not depend on them. OpenFOAM's

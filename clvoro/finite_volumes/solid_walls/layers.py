@@ -18,10 +18,13 @@ from ...mesh.diagram import Diagram
 from ...mesh.faces import Faces
 from ...mesh.geometry import sum_rows
 from ...mesh.results import thickness_in_words
+from ..collapse import collapse_short
 from ..gate import rejected_cells
+from .mend import narrow_faces
 from .mesh import diagram_of
 
 if TYPE_CHECKING:
+    from ...geometry.domain import Domain
     from ...geometry.solid.solid import Solid
 
 _SUITED = 0.25
@@ -39,10 +42,9 @@ _SWEEPS = 100
 """Steps that make the ways of vertices along walls smooth."""
 _RESIDUAL, _MOST = 1e-3, 60
 """Relative residual and most iterations of the linear systems for the ways of inner vertices."""
-_STIFFER = 20
-"""Steps that make the ways of the vertices of a `stiff` cell nearly linear in their places."""
-_ROUNDS, _THINNER, _LAST_ROUNDS = 7, 0.6, 8
-"""How often layers are made thinner where cells are rejected, by which factor, and how often they end there."""
+_ROUNDS, _THINNER, _THINNED = 15, 0.6, 3
+"""How often layers change where cells are rejected; by which factor they become thinner there, and how often before
+they end."""
 _STEEP = 65.0
 """Non-orthogonality, in degrees, beyond which cells count as rejected."""
 _FLAT = 500
@@ -72,19 +74,24 @@ def add_layers(diagram: Diagram, layers: Sequence[Layers]) -> tuple[Diagram, lis
 
     Warns with `MismatchWarning` where layers are thinner: how many polygons, and the place of the thinnest.
     """
-    walls = _LayeredWalls(diagram, layers)
+    walls = _LayeredWalls(diagram.domain, diagram.solver_mesh(), layers)
     share = walls.first_shares()
-    best = None
-    for k in range(_ROUNDS + _LAST_ROUNDS):
+    best, attempt = None, 0
+    while attempt < _ROUNDS:
         made = walls.extruded(share)
         bad = walls.rejected(made)
         if best is None or bad.count < best[0].count:
-            best = bad, made, share
+            best = bad, made, share, walls
         if not bad.count:
             break
-        share = walls.thinner(share, bad.vertices, k)
+        if (smoother := walls.without(bad.bulging)) is not walls:
+            share = smoother.smooth(np.minimum(share[smoother.rows_in(walls)], smoother.first_shares()))
+            walls = smoother
+        else:
+            share = walls.thinner(share, bad.vertices)
+            attempt += 1
     assert best is not None
-    _, made, share = best
+    _, made, share, walls = best
     faces, n = made.faces, len(diagram)
     middles = faces.measures.geometry.centroids[n:]
     found = diagram_of(replace(faces, generators=np.concatenate([faces.generators[:n], middles])))
@@ -97,10 +104,16 @@ def add_layers(diagram: Diagram, layers: Sequence[Layers]) -> tuple[Diagram, lis
 
 @dataclass(frozen=True)
 class _RejectedCells:
-    """Cells that OpenFOAM rejects: their number, and the vertices of walls whose layers are to blame, (k,) int."""
+    """Cells that OpenFOAM rejects.
+
+    - `count`: their number.
+    - `vertices` (k,) int: those of walls whose layers are to blame.
+    - `bulging` (f,) bool: small faces of the mesh without layers that make cells concave with them.
+    """
 
     count: int
     vertices: np.ndarray
+    bulging: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -122,17 +135,17 @@ class _LayeredWalls:
     - `vertices` (u,) int: vertices on walls, ascending; the arrays below have a row for each.
     """
 
-    def __init__(self, diagram: Diagram, layers: Sequence[Layers]) -> None:
-        self.solid, self.faces = cast("Solid", diagram.domain), diagram.solver_mesh()
-        f = self.faces
+    def __init__(self, domain: Domain, faces: Faces, layers: Sequence[Layers]) -> None:
+        self.solid, self.faces = cast("Solid", domain), faces
+        self.layers, f = layers, faces
         self.rows = np.arange(f.n_inner, len(f))
         self.patch = -1 - f.neighbor[self.rows].astype(np.int64)
         self.starts, corners = take_rows(f.starts, f.corners, self.rows)
         self.face = rows_of(self.starts)
         self.vertices, place = np.unique(corners, return_inverse=True)
         self.corners = place.reshape(-1)
-        self.stiff = np.zeros(f.n_cells, bool)
         self._last: np.ndarray | None = None
+        self._blamed = np.zeros(len(self.vertices), np.int64)
         self._read(layers)
         self._meet()
 
@@ -298,18 +311,20 @@ class _LayeredWalls:
                 return np.minimum(share, lower)
             share = np.minimum(share, lower)
 
-    def thinner(self, share: np.ndarray, bad: np.ndarray, attempt: int) -> np.ndarray:
-        """Return the shares (u,), smaller at the vertices `bad`, and around those of them that have no layers any more.
+    def thinner(self, share: np.ndarray, bad: np.ndarray) -> np.ndarray:
+        """Return the shares (u,), smaller at the vertices `bad` (k,), and around them where they are 0 already.
 
-        From the attempt `_ROUNDS` on layers end there, each time farther around them.
+        Layers end where vertices have been bad more than `_THINNED` times, each time farther around them.
         """
-        chosen, gone = np.zeros(len(share), bool), np.zeros(len(share), bool)
-        chosen[bad], gone[bad[share[bad] == 0]] = True, True
-        for _ in range(max(1, attempt - _ROUNDS + 1)):
-            ahead = self.end[gone[self.begin]]
-            gone[ahead] = True
+        blamed = self._blamed
+        blamed[bad] += 1
         less = share.copy()
-        less[chosen | gone] *= _THINNER if attempt < _ROUNDS else 0
+        less[bad] *= np.where(blamed[bad] > _THINNED, 0, _THINNER)
+        gone = np.zeros(len(share), bool)
+        gone[bad[share[bad] == 0]] = True
+        for _ in range(max(0, blamed[gone].max(initial=0) - _THINNED - 1)):
+            gone[self.end[gone[self.begin]]] = True
+        less[gone] = 0
         return self.smooth(less)
 
     # Vertices that follow.
@@ -414,7 +429,6 @@ class _LayeredWalls:
             )
             moved[band[inside], a] = found
         self._last = moved[band[inside]]
-        self._stiffen(moved)
         slid = above - way
         rows = np.flatnonzero(np.linalg.norm(slid, axis=1) > 1e-9 * self.sizes)
         walls = x[self.vertices]
@@ -424,36 +438,6 @@ class _LayeredWalls:
         rows = np.flatnonzero(self.border | (~self.column & (whole != above).any(axis=1)))
         moved[self.vertices[rows]] = self._onto_patches(rows, moved[self.vertices[rows]], bare=True)
         return moved, walls
-
-    def _stiffen(self, moved: np.ndarray) -> None:
-        """Make the ways `moved` (v, 3) nearly linear in the cells `stiff`, so that these stay convex."""
-        cells = np.flatnonzero(self.stiff)
-        if not len(cells):
-            return
-        f, free = self.faces, np.zeros(len(moved), bool)
-        free[self._followers[0]] = True
-        free &= self._wall < 0
-        starts, places = f.cell_faces()
-        _, sides = take_rows(starts, places, cells)
-        faces, of = f.sides()[1][sides], np.repeat(cells, np.diff(starts)[cells])
-        begin, corners = take_rows(f.starts, f.corners, faces)
-        key = distinct(np.repeat(of, np.diff(begin)) * len(moved) + corners)
-        cell, vertex = np.searchsorted(cells, key // len(moved)), key % len(moved)
-        count = np.bincount(cell)
-        middle = sum_rows(cell, f.points[vertex], len(count)) / count[:, None]
-        x = f.points[vertex] - middle[cell]
-        tensor = _sums(cell, x[:, :, None] * x[:, None, :])
-        inverse = np.linalg.pinv(tensor, rcond=1e-6, hermitian=True)
-        number = np.maximum(np.bincount(vertex, minlength=len(moved)), 1)
-        for _ in range(_STIFFER):
-            way = moved[vertex]
-            mean = _sums(cell, way) / count[:, None]
-            slope = inverse @ _sums(cell, x[:, :, None] * way[:, None, :])
-            fitted = mean[cell] + np.einsum("ki,kij->kj", x, slope[cell])
-            total = np.zeros_like(moved)
-            np.add.at(total, vertex, fitted)
-            rows = distinct(vertex[free[vertex]])
-            moved[rows] = total[rows] / number[rows, None]
 
     # Prisms.
 
@@ -485,7 +469,7 @@ class _LayeredWalls:
                 parts.append(self._sides(level, here, counts, innermost + counts - level, active, at))
         prism = np.repeat(chosen, counts[chosen])
         row = counts[prism] - (np.arange(len(prism)) + f.n_cells - innermost[prism])
-        return self._assembled(parts, points, moved, prism, row)
+        return self._assembled(parts, points, moved, prism, row, others)
 
     def _level_points(self, moved: np.ndarray, walls: np.ndarray, active: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the moved vertices and those of all levels but the innermost, (k, 3), and the first of these, (u,)."""
@@ -527,8 +511,9 @@ class _LayeredWalls:
         moved: np.ndarray,
         prism: np.ndarray,
         row: np.ndarray,
+        kept: np.ndarray,
     ) -> _Layered:
-        """Put all faces together."""
+        """Put all faces together; the first ones are the faces `kept` (k,) of the mesh without layers."""
         f = self.faces
         counts = np.concatenate([np.diff(part[0]) for part in parts])
         corners, owner, neighbor = (np.concatenate([part[k] for part in parts]) for k in (1, 2, 3))
@@ -551,7 +536,7 @@ class _LayeredWalls:
             neighbor=neighbor[order].astype(np.int32),
             twin=np.full(k, -1),
             shift=np.zeros((k, 3), np.int8),
-            half_face=np.full(k, -1),
+            half_face=np.append(kept, np.full(k - len(kept), -1))[order],
             layer=np.concatenate([np.zeros(f.n_cells, np.int16), row.astype(np.int16)]),
         ).compact()
         return _Layered(made, prism)
@@ -587,14 +572,26 @@ class _LayeredWalls:
         found[np.flatnonzero(kept)] = bad
         return found & judged
 
+    def without(self, bulging: np.ndarray) -> _LayeredWalls:
+        """Return the walls of the mesh without the faces `bulging` (f,) bool, or these walls if none of them can go."""
+        faces = collapse_short(self.faces, None, bulging, suspects=np.zeros(len(bulging), bool))
+        if len(faces) == len(self.faces):
+            return self
+        made = _LayeredWalls(self.solid, faces, self.layers)
+        made._rejected_before, made._blamed = self._rejected_before, self._blamed[made.rows_in(self)]
+        return made
+
+    def rows_in(self, walls: _LayeredWalls) -> np.ndarray:
+        """Return the row of each vertex, or of the nearest one, in `walls` before a collapse, (u,) int."""
+        return scipy.spatial.KDTree(walls.faces.points[walls.vertices]).query(self.faces.points[self.vertices])[1]
+
     def rejected(self, made: _Layered) -> _RejectedCells:
-        """Return the cells that OpenFOAM rejects because of layers; inner ones become `stiff` at first."""
+        """Return the cells that OpenFOAM rejects because of layers."""
         n, g = self.faces.n_cells, self.faces
         near, around = (np.concatenate([mask, np.ones(len(made.wall), bool)]) for mask in self._near)
         bad = self._rejected_of(made.faces, near, around)
         bad[:n] &= ~self._rejected_before
-        core = bad[:n] & self.stiff
-        self.stiff |= bad[:n]
+        count, core = int(bad.sum()), bad[:n]
         # The vertices of their prisms, those of bad cells, and those that these follow.
         sides, face = g.sides()
         _, corners = take_rows(g.starts, g.corners, face[core[sides]])
@@ -603,7 +600,12 @@ class _LayeredWalls:
         wall[band[inside]] = leader[inside]
         found = wall[distinct(corners)]
         of_prisms = self.corners[np.isin(self.face, made.wall[np.flatnonzero(bad[n:])])]
-        return _RejectedCells(int(bad.sum()), distinct(np.concatenate([of_prisms, found[found >= 0]])))
+        vertices = distinct(np.concatenate([of_prisms, found[found >= 0]]))
+        bad[n:] = False
+        part = made.faces.part(around)[0]
+        rows, bulging = part.half_face[narrow_faces(part, np.cbrt(part.volumes), bad[around])], np.zeros(len(g), bool)
+        bulging[rows[rows >= 0]] = True
+        return _RejectedCells(count, vertices, bulging)
 
     def reached(self, share: np.ndarray, layers: Sequence[Layers]) -> list[dict[str, float]]:
         """Return how thick the `layers` are; `share` (u,) is that at vertices. Warn where they are thin."""
