@@ -137,10 +137,10 @@ def test_layers_on_a_ball_are_full_though_wall_polygons_have_short_sides(adapter
 
 
 def test_small_faces_that_bulge_out_do_not_thin_layers(adapter):
-    """They are collapsed, on coarse meshes with a concave wall, too."""
+    """They are collapsed or flattened, on coarse meshes with a concave wall, too."""
     block = Solid.box((-1, -1, 0), (1, 1, 1)) - Solid.cylinder((0, 0, -1), (0, 0, 2), 0.5)
-    mesh = adapter.run(block, 0.2, layers=Layers(0.4 * 0.2 / 6.187, 4, 1.3))
-    assert mesh.summary()["thickness"][0]["full_share"] > 0.9  # 0.23 with these faces
+    mesh = adapter.run(block, 0.2, effort="fast", layers=Layers(0.4 * 0.2 / 6.187, 4, 1.3))
+    assert mesh.summary()["thickness"][0]["full_share"] > 0.99  # 0.23 with these faces
     assert mesh.check("openfoam")
     assert closes(mesh.diagram) < 1e-14
     assert mesh.check()

@@ -19,7 +19,7 @@ from ...mesh.faces import Faces
 from ...mesh.geometry import sum_rows
 from ...mesh.results import thickness_in_words
 from ..collapse import collapse_short
-from ..gate import rejected_cells
+from ..gate import judged_thoroughly, rejected_cells
 from .mend import narrow_faces
 from .mesh import diagram_of
 
@@ -45,6 +45,9 @@ _RESIDUAL, _MOST = 1e-3, 60
 _ROUNDS, _THINNER, _THINNED = 15, 0.6, 3
 """How often layers change where cells are rejected; by which factor they become thinner there, and how often before
 they end."""
+_FLATTENED, _FARTHER, _LEAST_FREE = 3, 1.3, 0.3
+"""How often small faces that bulge out move back, by which factor farther than their centers have to, and the least
+share of their vertices that counts as moving."""
 _STEEP = 65.0
 """Non-orthogonality, in degrees, beyond which cells count as rejected."""
 _FLAT = 500
@@ -539,7 +542,43 @@ class _LayeredWalls:
             half_face=np.append(kept, np.full(k - len(kept), -1))[order],
             layer=np.concatenate([np.zeros(f.n_cells, np.int16), row.astype(np.int16)]),
         ).compact()
-        return _Layered(made, prism)
+        return _Layered(self._flattened(made), prism)
+
+    def _flattened(self, faces: Faces) -> Faces:
+        """Return a mesh with layers in which small faces of inner cells bulge out less where that helps.
+
+        Their inner vertices move by the distance of the face's center from the plane of the face that it is beyond.
+        """
+        none = np.zeros(faces.n_cells - self.faces.n_cells, bool)
+        near, around = self._near
+        around = np.append(around, ~none)
+        part, number = faces.part(around)
+        judged = np.append(near & ~self._rejected_before, none)[around]
+        inner = judged_thoroughly(part)[1] & (part.neighbor >= 0)
+        free = np.ones(len(part.points), bool)
+        free[take_rows(part.starts, part.corners, np.flatnonzero(~inner))[1]] = False
+        points, fewest = faces.points, np.inf
+        for _ in range(_FLATTENED + 1):
+            (one, other), cells, _ = part.measures.concave_pairs(judged=judged)
+            if len(cells) < fewest:
+                fewest, points = len(cells), points.copy()
+                points[number] = part.points
+            if not len(cells):
+                break
+            g = part.measures.geometry
+            normal = g.areas[one] * np.where(part.owner[one] == cells, 1, -1)[:, None]
+            normal /= np.maximum(np.linalg.norm(normal, axis=1), 1e-300)[:, None]
+            beyond = ((g.centers[other] - g.centers[one]) * normal).sum(axis=1)
+            rows = np.flatnonzero(part.area[other] <= part.area[one])
+            starts, corners = take_rows(part.starts, part.corners, other[rows])
+            of, moving = rows_of(starts), free[corners]
+            share = np.bincount(of, moving, len(rows)) / np.diff(starts)
+            step = _FARTHER * np.maximum(beyond[rows], 0) / np.maximum(share, _LEAST_FREE)
+            rows, corners = rows[of[moving]], corners[moving]
+            total = np.stack([np.bincount(corners, -normal[rows, k] * step[of[moving]], len(free)) for k in range(3)])
+            number_of = np.maximum(np.bincount(corners, minlength=len(free)), 1)
+            part = replace(part, points=part.points + (total / number_of).T)
+        return replace(faces, points=points)
 
     # What is wrong.
 
