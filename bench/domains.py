@@ -1,18 +1,19 @@
 """The cost of domains: diagrams, runs and their meshes beside those of a box with walls.
 
     python bench/domains.py [--domains polygon,periodic] [--sizes 1e4,1e5] [--dims 2,3] [--edges 10000] [--repeat 3]
-                            [--effort fast] [--device NAME] [--dtype float32] [--json]
+                            [--effort fast] [--skip diagram] [--device NAME] [--dtype float32] [--json]
 
 The polygon, in 2D alone, is a coast of `--edges` edges with an island. In 3D alone, "cube" is the box as a solid, and
 "body" the air in it around a wavy body of 82,000 triangles. "diagram" is that of uniform random generators, with its
 arrays on the host; "run" has a constant size; "faces" makes its mesh with all faces, "for solvers" that for solvers.
 Microseconds of processor time per cell, over the device's compute units: medians of `--repeat` by turns, after a first
-call. In 3D there are a tenth of the cells. "memory" is the most so far of the whole process, in GB, on the host.
-"quality" is the mean of the cells.
+call; `--skip` leaves parts out. In 3D there are a tenth of the cells. "memory" is the most so far of the whole process,
+in GB, on the host. "quality" is the mean of the cells.
 """
 
 from __future__ import annotations
 
+import math
 import resource
 import statistics
 import time
@@ -30,7 +31,7 @@ def figure(*parts: str, digits: int = 2) -> Callable[[dict[str, Any]], str]:
     """Return the text of a column: the sum of some parts in the box, in the domain, and the ratio."""
 
     def text(row: dict[str, Any]) -> str:
-        box, domain = (sum(row[name][part] for part in parts) for name in ("box", "domain"))
+        box, domain = (sum(row[name].get(part, math.nan) for part in parts) for name in ("box", "domain"))
         return f"{box:.{digits}f}, {domain:.{digits}f}, {domain / box:.2f}"
 
     return text
@@ -64,7 +65,7 @@ OTHERS: dict[str, tuple[tuple[int, ...], Callable[..., Any]]] = {
 
 
 def compare(
-    adapter: clvoro.Adapter, domains: dict[str, Any], n: int, repeat: int, effort: Any
+    adapter: clvoro.Adapter, domains: dict[str, Any], n: int, repeat: int, effort: Any, skip: list[str]
 ) -> dict[str, dict[str, float]]:
     """Return microseconds per cell of each part of the work, and the memory, in each domain."""
     taken: dict[tuple[str, str], list[float]] = {}
@@ -77,7 +78,7 @@ def compare(
                 "faces": lambda result: (result, result.diagram.faces.area)[0],
                 "for solvers": lambda result: result.diagram.solver_mesh().area,
             }
-            for part, work in parts.items():
+            for part, work in ((part, work) for part, work in parts.items() if part not in skip):
                 began = time.process_time()
                 made = work(made)
                 if part == "run":
@@ -99,6 +100,7 @@ def main() -> None:
     made.add_argument("--edges", type=lambda text: counts(text)[0], default=10_000)
     made.add_argument("--repeat", type=int, default=3)
     made.add_argument("--effort", default="fast")
+    made.add_argument("--skip", type=names, default=[], help="as the diagram, whose cures take long in large solids")
     options = made.parse_args()
     adapter, report = make_adapter(options), Report(options.json, COLUMNS)
     for kind in options.domains:
@@ -106,7 +108,7 @@ def main() -> None:
             box = clvoro.Box((0,) * dim, (1,) * dim)
             other = OTHERS[kind][1](box, options.edges)
             for n in options.sizes if dim == 2 else [n // 10 for n in options.sizes]:
-                found = compare(adapter, {"box": box, "domain": other}, n, options.repeat, options.effort)
+                found = compare(adapter, {"box": box, "domain": other}, n, options.repeat, options.effort, options.skip)
                 report.add({"kind": kind, "dim": dim, "cells": n, **found}, f"{kind}, {dim}D, {n}")
     report.finish(heading(adapter, "Domains beside boxes, microseconds per cell"))
 
