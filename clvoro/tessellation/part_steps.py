@@ -67,12 +67,12 @@ FILLED, MATCHED = {"float64": 1e-8, "float32": 1e-3}, {"float64": 1e-5, "float32
 relative difference between the measures of faces between parts, seen from both sides."""
 GROUP = 64
 """Number of balls in each group of the balls that another part has sent."""
-MENDED, WIDER = 256, 1.2
-"""Largest number of generators that get other limits without asking for all anew. Radius of their balls over the needed
-one."""
-FAILED = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0])
-"""Summands of a part whose update has failed: zeros for those of `Part.sums`, 1 for the number of failed parts, and the
-attempt to trace the boundary of a polygon."""
+MENDED, WIDER = (256, 0.02), 1.2
+"""Largest number of generators that get other limits without asking for all anew, and as a share of all if that is
+more. Radius of their balls over the needed one."""
+FAILED = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0])
+"""Summands of a part whose update has failed: zeros for those of `Part.sums`, 1 for the number of failed parts, the
+attempt to trace the boundary of a polygon, and the number of generators."""
 
 
 @cache
@@ -509,7 +509,7 @@ class PartSteps(DomainSteps):
             if t is not None:
                 given = self._at, self._limits_there, 2 * (1 + NOISE[engine.real.name]), self._reads_rows, needed
                 attempt = 0 if self._cut is None else self._cut.attempt
-                sums = np.append(part.sums(engine, t, *given, self._periods), [0, attempt])
+                sums = np.append(part.sums(engine, t, *given, self._periods), [0, attempt, n])
             sums = self.peers.total(sums)
             if sums[6] or t is None:
                 # Ghost generators outside may be too near to cells that this part does not know.
@@ -517,9 +517,11 @@ class PartSteps(DomainSteps):
                 return None
             if self._answers is not None or sums[3] + sums[4]:
                 radii, moves = needed.get().T.astype(float, order="C")
-                if not sums[3] + sums[4]:
+                if self._answers is not None:
                     self._settle(self._answers, part, radii)
-                elif not self._mend_limits(part, radii, moves, *sums[3:5]) and not self._ask_again(part, radii):
+                few = max(*sums[3:5]) <= max(MENDED[0], MENDED[1] * sums[8])
+                mended = not sums[3] + sums[4] or (few and self._mend_limits(part, radii, moves, *sums[3:5]))
+                if not mended and not self._ask_again(part, radii):
                     return None
             if not sums[7]:
                 break
@@ -569,8 +571,6 @@ class PartSteps(DomainSteps):
         The balls of `short` generators are too small for their `needed` (n,) radii; `beyond` generators have moved too
         far. `moves` (n,) say how far each has moved.
         """
-        if max(short, beyond) > MENDED or self._answers is not None:
-            return False
         limits, share = self._limits, 1 - 1e-5
 
         def places(rows: np.ndarray) -> np.ndarray:
@@ -618,13 +618,16 @@ class PartSteps(DomainSteps):
                 near = gaps(np.tile(centers, 2), balls.boxes) - most < asked[:, -1:]
                 if kind:
                     near[np.isin(asked[:, -2], self._rows[self._sides == side])] = False
-                for k in np.flatnonzero(near.any(axis=1)):
-                    others = balls.chunks.rows(np.flatnonzero(near[k]))
-                    others = others if kind else np.setdiff1d(others, self._sent[side])
-                    away = np.linalg.norm(balls.centers[others] - centers[k], axis=1)
-                    least = np.minimum(limits[others], np.maximum(used[others], (limits[others] + used[others]) / 2))
-                    limits[others] = np.clip(away - asked[k, -1], least, limits[others])
-                    ends[k] = np.min(away - limits[others], initial=ends[k])
+                which, chunks = np.nonzero(near)
+                others, which = balls.chunks.rows(chunks), np.repeat(which, balls.chunks.sizes[chunks])
+                if not kind:
+                    known = np.zeros(len(limits), bool)
+                    known[self._sent[side]] = True
+                    others, which = others[~known[others]], which[~known[others]]
+                away = np.sqrt(_squares((balls.centers[others] - centers[which]).T))
+                least = np.minimum(limits[others], np.maximum(used[others], (limits[others] + used[others]) / 2))
+                np.minimum.at(limits, others, np.maximum(away - asked[which, -1], least))
+                np.minimum.at(ends, which, away - limits[others])
             found.append(ends)
         ends = np.min(peers.exchange(found, np.full(peers.count, len(rows))), axis=0)
         if peers.any(bool((ends < enough * wanted).any())):
@@ -655,7 +658,8 @@ class PartSteps(DomainSteps):
 
     def _settle(self, answers: Answers, part: Part, needed: np.ndarray) -> None:
         """Divide the room around the balls that cells of `part` need, and set the limits of own generators."""
-        told, self._answers = self.peers.exchange([answers.settle(needed)] * self.peers.count), None
+        settled = answers.settle(np.minimum(needed, answers.balls.radii))
+        told, self._answers = self.peers.exchange([settled] * self.peers.count), None
         grown = {}
         for side, facing in answers.facing.items():
             settled = told[side // len(self._shifts)]

@@ -210,6 +210,25 @@ def test_steps_have_the_same_bits_in_any_number_of_parts(ctx, kind, monkeypatch)
     assert kind == "polygon" or np.abs(one.points[:, 0] - x[:, 0]).max() > 5
 
 
+def test_parts_ask_once_where_few_cells_need_larger_balls(ctx, monkeypatch):
+    """Five cells need larger balls than those for which the parts have asked, and get them without other ghosts."""
+    asked, finish = set(), PartSteps._finished
+
+    def noted(steps, part, t):
+        found = finish(steps, part, t)
+        if found is not None and part.ghosts is not None:
+            asked.add(steps.asked)
+        return found
+
+    monkeypatch.setattr(PartSteps, "_finished", noted)
+    monkeypatch.setitem(FIRST_REACH, 3, 1.6)
+    x = (np.indices((12, 12, 12)).reshape(3, -1).T + 0.4 + 0.2 * np.random.default_rng(70103).random((1728, 3))) / 12
+    given = clvoro.Box((0, 0, 0), (1, 1, 1)), 1 / 12
+    one, two = (run_in(parts, ctx, *given, points=x, method="lloyd", max_steps=0)[1] for parts in (1, 2))
+    assert asked == {1}
+    assert np.array_equal(one.neighbors, two.neighbors)
+
+
 def test_a_run_in_parts_of_a_periodic_box(ctx, tmp_path):
     """From levels of few cells on, by way of a checkpoint; what has too few cells across a period is refused."""
     given = clvoro.Box((0, 0), (1, 1), periodic=True), lambda p: 0.08 * (1.5 + np.sin(2 * np.pi * p[:, 0]))
