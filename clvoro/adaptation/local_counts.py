@@ -8,6 +8,7 @@ inserted and deleted instead, where this saves the most displacement.
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from itertools import count
 from typing import TYPE_CHECKING
 
@@ -19,9 +20,13 @@ from ..opencl.engine import Engine
 from ..opencl.workspace import framed
 from ..solvers.components import Components, balance_components
 from . import tuning
+from .density import CellWeights
 
 if TYPE_CHECKING:
-    from .density import CellWeights
+    from ..geometry.domain import Domain
+    from ..tessellation.device_diagram import Tessellation
+    from .insertion_deletion import Present
+    from .stages import Stages
     from .state import MeshState
 
 
@@ -37,8 +42,8 @@ class PieceCounts:
     The potential of each piece has a free constant, which is set here. The work is done on the host.
     """
 
-    def __init__(self, mesh: MeshState, w: CellWeights) -> None:
-        self._components = Components(mesh.engine, mesh.t)
+    def __init__(self, engine: Engine, t: Tessellation, w: CellWeights) -> None:
+        self._components = Components(engine, t)
         self._cells, self._required = self._components.sums(None, w.weight)
 
     def offset(self, potential: cla.Array, changes: cla.Array) -> None:
@@ -58,21 +63,42 @@ class LocalCounts:
         self._kernels = engine.kernels("adaptation/local_counts")
         self._accepted = engine.empty(2, np.int32)
 
-    @framed
     def choose(self, mesh: MeshState, w: CellWeights, changes: cla.Array) -> bool:
         """Write to `changes` (n,) int32 where to insert (1) and where to delete (-1); return whether it is anywhere.
 
         Each round takes the sites where the potential is largest, solves for the potential after changes there, and
-        accepts those that gain enough.
+        accepts those that gain enough. Of few cells part 0 does this for all parts.
         """
-        engine, k, n, t, poisson = self.engine, self._kernels, mesh.n, mesh.t, mesh.stages.poisson
-        selection, real = mesh.stages.insertion_deletion, engine.real.type
+        present, peers, missing = mesh.present, self.engine.peers, mesh.missing_cells(w)
+        ghosts = None if present.t.part is None else present.t.part.ghosts
+        if peers.count == 1 or ghosts is None or mesh.total > tuning.BALANCED_ALONE:
+            return self._choose(mesh.stages, mesh.domain, present, w, missing, changes)
+        t, sizes, found = present.t, np.array(peers.gather(np.array(mesh.n))), np.empty(0, np.int32)
+        starts, rows = t.starts.get(), ghosts.rows_of_all(sizes)
+        columns, measures = (array.get()[: starts[-1]] for array in (t.neighbors, t.face_measures))
+        columns = np.where(columns < 0, columns, rows[np.maximum(columns, 0)]).astype(np.int32)
+        own = (array.get()[: mesh.n] for array in (t.points, present.generators.labels, w.weight, w.log_ratio))
+        of_all = [peers.collect(array) for array in (np.diff(starts), columns, measures, *own)]
+        if peers.number == 0:
+            counts, *given = (np.concatenate(arrays) for arrays in of_all)
+            found = _choose_alone(mesh, missing, np.append(0, np.cumsum(counts)).astype(np.int32), *given)
+        slices = np.split(found, np.cumsum(sizes)[:-1]) if len(found) else [found] * peers.count
+        changes.set(peers.exchange(slices)[0])
+        return peers.any(bool(found.any()))
+
+    @framed
+    def _choose(
+        self, stages: Stages, domain: Domain, present: Present, w: CellWeights, missing: float, changes: cla.Array
+    ) -> bool:
+        """Do this with `stages` of this engine, where `missing` cells are missing over all parts."""
+        engine, k, t, poisson = self.engine, self._kernels, present.t, stages.poisson
+        selection, real, n, most = stages.insertion_deletion, engine.real.type, t.n, int(engine.peers.total(t.n))
         potential, before, source = (engine.scratch(n) for _ in range(3))
         chosen, blocked, keys = (engine.scratch(t.rows, np.uint64) for _ in range(3))
         for array in (potential, changes, chosen, blocked):
             array.fill(0)
-        missing, total = mesh.missing_cells(w), 0
-        pieces = PieceCounts(mesh, w) if mesh.domain.n_pieces > 1 else None
+        total = 0
+        pieces = PieceCounts(engine, t, w) if domain.n_pieces > 1 else None
         graph = *t.graph, t.face_measures, t.points
         laplacian = poisson.assemble(*graph, tolerance=tuning.BALANCE_TOLERANCE, part=t.part)
         for turn in count():
@@ -83,9 +109,9 @@ class LocalCounts:
                 gains = w.log_ratio, potential, offset, real(tuning.LEAST_GAIN)
                 away = selection.spread(t, blocked, tuning.BLOCKED_RINGS)
                 engine.run_each(k.score_potential, n, *t.graph, *gains, away, *t.name_args, keys)
-                chosen = selection.choose_once(mesh.present, keys, tuning.SITE_RINGS)
+                chosen = selection.choose_once(present, keys, tuning.SITE_RINGS)
             engine.run_each(k.try_changes, n, w.weight, changes, chosen, potential, offset, before, source)
-            balance_components(mesh.engine, mesh.domain, t, source, w.weight)
+            balance_components(engine, domain, t, source, w.weight)
             poisson.solve(
                 laplacian,
                 source,
@@ -104,7 +130,7 @@ class LocalCounts:
             engine.run_each(k.accept_changes, n, *gains, *found)
             inserted, deleted = map(int, engine.peers.total(read_numbers(self._accepted, 0, 2)))
             missing, total = missing - inserted + deleted, total + inserted + deleted
-            if inserted + deleted <= tuning.LEAST_CHANGES * mesh.total:
+            if inserted + deleted <= tuning.LEAST_CHANGES * most:
                 break
         return total > 0
 
@@ -113,3 +139,23 @@ class LocalCounts:
         found = self.engine.scratch(len(changes), np.uint64)
         self.engine.run_each(self._kernels.select_changes, len(changes), changes, np.int32(sign), found)
         return found
+
+
+def _choose_alone(mesh: MeshState, missing: float, *of_all: np.ndarray) -> np.ndarray:
+    """Return what `LocalCounts.choose` writes, for the cells of all parts.
+
+    `of_all` are, for these cells: starts, neighbors and face measures, as of a diagram, positions and labels of the
+    generators, `CellWeights.weight` and `log_ratio`.
+    """
+    engine = mesh.engine.alone()
+    starts, neighbors, measures, points, labels, weight, log_ratio = (engine.upload(a, a.dtype) for a in of_all)
+    stages, changes = mesh.setup.on(engine).stages, engine.empty(len(labels), np.int32)
+    n, faces = len(labels), {"starts": starts, "neighbors": neighbors, "face_measures": measures}
+    assert mesh.t.part is not None
+    # What is not replaced is not used.
+    part = replace(mesh.t.part, n_own=n, count=n, points=points, ghosts=None, labels=labels)
+    t = replace(mesh.t, n=n, points=points, part=part, whole=None, **faces)
+    present = replace(mesh.present, t=t, generators=replace(mesh.present.generators, labels=labels))
+    w = CellWeights(weight, weight, log_ratio)
+    stages.local_counts._choose(stages, mesh.domain, present, w, missing, changes)
+    return changes.get()

@@ -98,6 +98,8 @@ at least `LEAST_OFFSET` and at most `LEAST_GAIN`. The whole offset is at most `L
 it is `LEAST_OFFSET` per cell. It favors insertions."""
 BALANCE_TOLERANCE = 3e-2
 """Relative residual of the potential of a balance."""
+BALANCED_ALONE = 150_000
+"""Cells of all parts up to which part 0 balances them alone: its rounds have few cells for each of many messages."""
 
 # Steps and their solves.
 

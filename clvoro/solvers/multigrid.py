@@ -359,10 +359,9 @@ class Multigrid:
 
     def _gather(self, graph: Graph, sizes: np.ndarray) -> Callable[[cla.Array, cla.Array], None]:
         """Set up the levels from `graph` on with the cells of all parts, `sizes` (p,). Return what sets x = M^-1 b."""
-        peers, n, firsts = self.engine.peers, len(graph), np.cumsum(sizes) - sizes
+        peers, n = self.engine.peers, len(graph)
         assert graph.ghosts is not None
-        starts, first = graph.starts.get(), int(firsts[peers.number])
-        rows = np.concatenate([first + np.arange(n), firsts[graph.ghosts.parts] + graph.ghosts.rows.get()])
+        starts, rows = graph.starts.get(), graph.ghosts.rows_of_all(sizes)
         columns, weights = (array.get()[: starts[-1]] for array in (graph.columns, graph.weights))
         columns = np.where(columns < 0, columns, rows[np.maximum(columns, 0)]).astype(np.int32)
         given = np.diff(starts), columns, weights

@@ -102,6 +102,16 @@ class Ghosts:
                     engine.run_each(kernels.unpack_rows, g, np.int32(n_own), taken, *which, array)
         return totals
 
+    def rows_of_all(self, sizes: np.ndarray) -> np.ndarray:
+        """Return where own generators, and then ghosts, are among the generators of all parts, (n_own + g,) int.
+
+        `sizes` (p,) are the numbers of own generators of the parts.
+        """
+        assert self.peers is not None
+        firsts = np.cumsum(sizes) - sizes
+        own = firsts[self.peers.number] + np.arange(sizes[self.peers.number])
+        return np.concatenate([own, firsts[self.parts] + self.rows.get()])
+
     def shift(self, engine: Engine, n_own: int, periods: np.ndarray, points: cla.Array) -> None:
         """Move the ghosts in `points`, rows from `n_own` on, by the periods of their codes; `periods` (4,) real."""
         shift = engine.kernels("tessellation/part", shared=True).shift_ghosts

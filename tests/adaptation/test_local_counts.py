@@ -10,6 +10,8 @@ from clvoro.adaptation.plan.actions import BalanceCounts, Refine, RepairCells
 from clvoro.adaptation.plan.schedule import adaptive_schedule
 from clvoro.adaptation.stages import Stages
 from clvoro.opencl.engine import Engine
+from clvoro.opencl.peers import ALONE
+from clvoro.opencl.threads import Team
 from clvoro.sizing import Sizing, as_field
 from tests.reference import local_counts as reference
 from tests.reference import patch
@@ -38,11 +40,11 @@ def unbalanced(left, right, pieces=False):
     return np.concatenate([*parts, grid(APART, 0.6, (7, 7), rng)] if pieces else parts)
 
 
-def make_mesh(ctx, domain, points, fixed=0, real=np.float64):
-    engine = Engine(ctx, cl.CommandQueue(ctx), 2, np.dtype(real), domain.traits(np.dtype(real)))
+def make_mesh(ctx, domain, points, fixed=0, real=np.float64, peers=ALONE, labels=None):
+    engine = Engine(ctx, cl.CommandQueue(ctx), 2, np.dtype(real), domain.traits(np.dtype(real)), peers=peers)
     on_device = engine.upload(domain.place(points, engine.real))
     sizing = Sizing(engine, domain, as_field(H))
-    return patch.make_mesh(Stages(engine), domain, sizing, on_device, fixed=fixed)
+    return patch.make_mesh(Stages(engine), domain, sizing, on_device, fixed=fixed, labels=labels)
 
 
 def chosen(mesh):
@@ -52,7 +54,7 @@ def chosen(mesh):
         changes = mesh.engine.scratch(mesh.n, np.int32)
         some = mesh.stages.local_counts.choose(mesh, w, changes)
         found = changes.get()
-    assert some == found.any()
+    assert some == mesh.engine.peers.any(found.any())
     return found
 
 
@@ -89,6 +91,28 @@ def test_choice(ctx, monkeypatch, name, fixed):
     expected = reference.changes(cells_of(mesh), held)
     assert np.array_equal(found, expected)
     assert min((expected > 0).sum(), (expected < 0).sum()) >= 3
+
+
+@pytest.mark.parametrize("name", list(DOMAINS))
+@pytest.mark.parametrize("most", [0, tuning.BALANCED_ALONE])
+def test_choice_of_parts(ctx, monkeypatch, name, most):
+    """With exact potentials two parts choose the same; the first one chooses for both, with few messages."""
+    monkeypatch.setattr(tuning, "BALANCE_TOLERANCE", 1e-11)
+    monkeypatch.setattr(tuning, "BALANCED_ALONE", most)
+    points = unbalanced((14, 8), (8, 11), name != "rooms")
+    whole = make_mesh(ctx, DOMAINS[name], points)
+    expected = np.zeros(len(points), int)
+    expected[whole.labels.get()] = chosen(whole)
+
+    def work(peers):
+        rows = np.array_split(np.arange(len(points)), 2)[peers.number]
+        mesh = make_mesh(ctx, DOMAINS[name], points[rows], labels=rows, peers=peers)
+        before = peers.exchanges
+        return mesh.labels.get(), chosen(mesh), peers.exchanges - before
+
+    (labels, found, exchanges), other = Team(2).run(work)
+    assert np.array_equal(np.concatenate([found, other[1]]), expected[np.concatenate([labels, other[0]])])
+    assert (exchanges < 10) == (most > 0)
 
 
 def in_both(mesh):

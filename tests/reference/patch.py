@@ -39,10 +39,10 @@ def make_engine(ctx, real="float64", dim=2, group_size=None, box=BOX):
     return engine
 
 
-def make_mesh(stages, domain, sizing, points, size_factor=1.0, fixed=0):
-    """Return the mesh of `points` (n, d) on the device, in normalized coordinates."""
+def make_mesh(stages, domain, sizing, points, size_factor=1.0, fixed=0, labels=None):
+    """Return the mesh of `points` (n, d) on the device, in normalized coordinates; `labels` are by default 0 to n."""
     setup = Setup(stages, domain, sizing, domain, fixed, np.empty((0, domain.dim)))
-    labels = stages.engine.upload(np.arange(len(points)), np.int32)
+    labels = stages.engine.upload(np.arange(len(points)) if labels is None else labels, np.int32)
     return MeshState(setup, size_factor, {"points": points, "labels": labels})
 
 
