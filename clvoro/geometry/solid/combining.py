@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ...errors import InputError, MissingLibraryError
+from ...arguments import warn
+from ...errors import InputError, MismatchWarning, MissingLibraryError
 from ..triangles import NamedTriangles
 
 if TYPE_CHECKING:
@@ -14,6 +15,8 @@ if TYPE_CHECKING:
 
 _ON_SIDE = 1e-9
 """Distance of vertices of a body from a side of its box, over the extent of the box, up to which they are on it."""
+_LARGER = 10
+"""A body that is so many times as long as its box along all axes is probably in another unit."""
 
 
 def named_triangles(solid: Solid) -> NamedTriangles:
@@ -40,6 +43,12 @@ def around(body: Solid, box: Solid) -> NamedTriangles:
         raise InputError(
             f"Solid.outside got a body from {body.lower} to {body.upper} and a box from {box.lower} to {box.upper}, "
             "which do not overlap; do they have the same unit? Solid.read has units="
+        )
+    if (body.extent > _LARGER * box.extent).all():
+        warn(
+            f"Solid.outside got a body from {body.lower} to {body.upper} and a box from {box.lower} to {box.upper}, of "
+            "which little is left; do they have the same unit? Solid.read has units=",
+            MismatchWarning,
         )
     # A body that stands on a side is on it up to round-off only.
     for side in (np.array(box.lower), np.array(box.upper)):

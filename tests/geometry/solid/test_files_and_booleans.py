@@ -78,6 +78,9 @@ def test_the_outside_of_a_body_has_the_names_of_both():
     )
     with pytest.raises(InputError, match="do not overlap"):
         Solid.outside(CUBE, ((5, 5, 5), (6, 6, 6)))
+    pytest.importorskip("manifold3d")
+    with pytest.warns(MismatchWarning, match="do they have the same unit"):
+        Solid(1000 * V, T).outside(((-1, -1, -1), (1, 1, 1)))
 
 
 def test_a_cavity_of_the_body_is_not_outside():
