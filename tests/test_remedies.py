@@ -548,8 +548,6 @@ ROWS = [
     # Spheres.
     (lambda t: clvoro.Sphere(1e300), lambda t: clvoro.Sphere(6371)),
     (lambda t: GLOBE.boundary(), lambda t: BOX.boundary()),
-    (lambda t: t.run(t.ocean.domain, 0.7), lambda t: t.run(GLOBE, 0.7).subset),
-    (lambda t: t.ocean.domain.boundary(), lambda t: t.run(GLOBE, 0.7)),
     (lambda t: t.part.domain.boundary(), lambda t: BOX.boundary()),
     (lambda t: t.run(GLOBE, raster((-90, -180), (90, 180))), lambda t: t.run(GLOBE, raster((-180, -90), (180, 90)))),
     (
@@ -1333,7 +1331,6 @@ def meshes(ctx, tmp_path_factory):
         "cube": adapter.diagram(CUBE, solid),
         "globe": globe,
         "large_globe": adapter.diagram(clvoro.Sphere(2), 2 * globe.points),
-        "ocean": globe.subset(globe.points[:, 2] > 0),
         "holed": adapter.diagram(clvoro.Polygon(SQUARE, [HOLE]), POINTS[~clvoro.Polygon(HOLE).covers(POINTS)]),
         "around": adapter.diagram(small, [(0.3, 0.5), (0.05, 0.5), (0.95, 0.5)]),
         "power": adapter.power_diagram(BOX, POINTS, 0.001 * np.arange(30)),

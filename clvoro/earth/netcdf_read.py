@@ -14,7 +14,8 @@ import scipy
 
 from ..connectivity import components, following, starts_of
 from ..files import open_plain
-from ..geometry.sphere import EARTH_RADIUS, Sphere, SphereRegion, triangle_areas
+from ..geometry.sphere import EARTH_RADIUS, Sphere, triangle_areas
+from ..geometry.subdomain import SphereRegion
 from ..io.arrays import FileError, explained
 from ..mesh.check.rebuilt import rebuild_on_sphere
 from ..mesh.diagram import Diagram
@@ -75,11 +76,9 @@ def make_diagram(cells: MeshInFile) -> Diagram:
     alone = np.flatnonzero(neighbors < 0)
     sphere = Sphere(radius)
     if len(alone):
-        beyond, walls = _removed(cells, owner[alone], ends[alone], alone)
-        neighbors[alone] = -1 - walls
-        area = min(float(volumes.sum()), sphere.measure)
-        within = cells.points[np.unique(owner[alone])]
-        sphere = SphereRegion(radius, within=within, beyond=beyond, area=area)
+        beyond = _removed(cells, owner[alone], ends[alone], alone)
+        neighbors[alone] = -1 - np.arange(len(alone))
+        sphere = SphereRegion(sphere, cells.points[owner[alone]], beyond, float(volumes.sum()))
     known = {
         "points": cells.points,
         "volumes": volumes,
@@ -105,10 +104,8 @@ def _neighbors(owner: np.ndarray, ends: np.ndarray, v: int) -> np.ndarray:
     return np.where(ranked[place] == there, owner[order[place]], -1)
 
 
-def _removed(
-    cells: MeshInFile, owner: np.ndarray, ends: np.ndarray, faces: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the generators of removed cells (b, 3), and which of them is behind each boundary face (k,).
+def _removed(cells: MeshInFile, owner: np.ndarray, ends: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Return the generator of the removed cell behind each boundary face, (k, 3).
 
     A face is on the bisector of both generators. So the other one is the reflection of that of the cell, through the
     middle of the arc between them, or else at the plane of the face.
@@ -128,14 +125,15 @@ def _removed(
     usable = np.isfinite(other).all(axis=1)
     if not usable.any():
         raise FileError("its boundary has no face with a length")
-    other = np.where(usable[:, None], other, own)
+    tree = scipy.spatial.KDTree(other[usable])
+    other[~usable] = other[usable][tree.query(v[~usable])[1]]
     away = np.linalg.norm(other - own, axis=1)
-    near = scipy.spatial.KDTree(other).query_pairs(_SAME * float(away[usable].min()), output_type="ndarray")
+    near = scipy.spatial.KDTree(other).query_pairs(_SAME * float(away.min()), output_type="ndarray")
     label = components(len(own), *near.T)[1]
-    # The longest face of each removed cell places its generator best. Walls are in the order of their first faces.
+    # The longest face of each removed cell places its generator best.
     rank = np.lexsort((-lengths, ~usable, label))
     best = rank[np.flatnonzero(np.diff(label[rank], prepend=-1))]
-    return radius * other[best], label
+    return radius * other[best[label]]
 
 
 _PLANE = "it is a mesh in the plane, expected one on a sphere; load a .npz or .vtu file instead"

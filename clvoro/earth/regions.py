@@ -21,7 +21,8 @@ import scipy
 from ..arguments import check_choice, check_integer, warn
 from ..connectivity import components, following
 from ..errors import InputError, InputTypeError, MismatchWarning
-from ..geometry.sphere import Sphere, SphereRegion
+from ..geometry.sphere import Sphere
+from ..geometry.subdomain import SphereRegion
 from ..mesh.diagram import Diagram
 from ..mesh.results import Result
 from ..mesh.subset import check_mask
@@ -330,7 +331,7 @@ def cells_across(diagram: Diagram, sphere: Sphere, line: np.ndarray) -> np.ndarr
     """
     n, unit = len(diagram), diagram.points
     if isinstance(sphere, SphereRegion):
-        unit = np.concatenate([unit, sphere.beyond])
+        unit = np.concatenate([unit, np.unique(sphere.beyond, axis=0)])
     unit = unit / np.linalg.norm(unit, axis=1)[:, None]
     tree = scipy.spatial.KDTree(unit)
     path = sphere.positions(_divided(line)) / sphere.radius

@@ -367,15 +367,12 @@ class Domain(ClipBox):
         return np.abs(((points - anchors) * normals).sum(axis=1))
 
     def toward_walls(self, walls: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the normals (k, d) of `walls` (k,) int, and the signed distances (k,) of `points` (k, d) from them.
-
-        On a part of a sphere the normal leads to the removed generator, and the distance is half of that way.
-        """
+        """Return the normals (k, d) of `walls` (k,) int, and the signed distances (k,) of `points` (k, d) from them."""
         normals, anchors = self.wall_planes(walls)
         return normals, ((anchors - points) * normals).sum(axis=1)
 
     def mirrored(self, walls: np.ndarray, points: np.ndarray) -> np.ndarray:
-        """Return the mirror images (k, d) of `points` (k, d) behind `walls` (k,) int; there the removed generators."""
+        """Return the mirror images (k, d) of `points` (k, d) behind `walls` (k,) int; removed generators are there."""
         normals, gaps = self.toward_walls(walls, points)
         return points + 2 * gaps[:, None] * normals
 

@@ -1,4 +1,4 @@
-"""A part of a box or a polygon: the cells of a mesh that are left when others are removed."""
+"""Parts of domains: the cells of a mesh that are left when others are removed."""
 
 from __future__ import annotations
 
@@ -15,8 +15,12 @@ from ..errors import InputError
 from ..opencl.engine import Traits
 from .boundary_names import BoundaryNames, Walls
 from .domain import Domain
-from .sphere import COAST
+from .sphere import Sphere
 
+COAST = "coast"
+"""Name of the boundary towards removed cells unless the caller gives another one."""
+_SINGLE = 1 + 1e-4
+"""Area of a part of a sphere over that of the sphere: sums of areas may be in single precision."""
 _ROUNDINGS = 64 * float(np.finfo(np.float32).eps)
 """Distance to a generator, over itself, by which a point may be beyond the boundary: that of meshes in float32."""
 
@@ -46,7 +50,7 @@ class Subdomain(Domain):
     names: Mapping[str, Walls] | None = None
 
     def __post_init__(self) -> None:
-        for name in ("lower", "upper", "periodic", "cuts_cells", "curved_walls"):
+        for name in ("periodic", "cuts_cells", "curved_walls"):
             object.__setattr__(self, name, getattr(self.whole, name))
         for name in ("within", "beyond"):
             what = f"Subdomain {name}"
@@ -61,7 +65,18 @@ class Subdomain(Domain):
         object.__setattr__(self, "names", self._checked_names())
 
     def __repr__(self) -> str:
-        return f"Subdomain({self.area / self.whole.measure:.3%} of {self.whole!r}, {', '.join(self.boundary_names)})"
+        share, names = self.area / self.whole.measure, ", ".join(self.boundary_names)
+        return f"{type(self).__name__}({share:.3%} of {self.whole!r}, {names})"
+
+    @property
+    def lower(self) -> tuple[float, ...]:  # type: ignore[override]
+        """Lower corner of the bounding box of the whole domain."""
+        return self.whole.lower
+
+    @property
+    def upper(self) -> tuple[float, ...]:  # type: ignore[override]
+        """Upper corner of the bounding box of the whole domain."""
+        return self.whole.upper
 
     @property
     def measure(self) -> float:
@@ -126,14 +141,22 @@ class Subdomain(Domain):
         found[cut] = super().wall_distance(walls[cut], points[cut])
         return found
 
+    def mirrored(self, walls: np.ndarray, points: np.ndarray) -> np.ndarray:
+        """Return the mirror images (k, d) of `points` (k, d) behind `walls` (k,) int; there the removed generators."""
+        found, cut = super().mirrored(walls, points), self.removed_behind(walls)
+        found[cut] = self.beyond[walls[cut] - self.n_whole]
+        return found
+
     def contains(self, points: np.ndarray) -> np.ndarray:
         """Return for each of `points` (n, d) whether it lies in a cell that is left, on the boundary included."""
-        points = check_rows("points", points, self.dim)
-        return self.whole.contains(points) & (self._beyond_by(points) <= 0)
+        points = self.whole.check_rows("points", points)
+        here, there = self._away(points)
+        return self.whole.contains(points) & ((here - there) / 2 <= _ROUNDINGS * here)
 
     def boundary_distance(self, points: np.ndarray) -> np.ndarray:
         """Return a lower bound of the distance of each of `points` (n, d) to the boundary, (n,)."""
-        return np.minimum(self.whole.boundary_distance(points), np.abs(self._beyond_by(points)))
+        here, there = self._away(points)
+        return np.minimum(self.whole.boundary_distance(points), np.abs(here - there) / 2)
 
     def closest_walls(self, points: np.ndarray) -> np.ndarray:
         """Return for each of `points` (n, d) on the boundary the closest wall, (n,) int."""
@@ -143,10 +166,9 @@ class Subdomain(Domain):
         at_cut = away < self.whole.boundary_distance(points)
         return np.where(at_cut, self.n_whole + np.asarray(pair), found)
 
-    def _beyond_by(self, points: np.ndarray) -> np.ndarray:
-        """Return half of by how much each of `points` is nearer to a removed generator than to one that is left."""
-        here, there = (tree.query(self.whole.wrap(points))[0] for tree in self._trees)
-        return (here - there) / 2 - _ROUNDINGS * here
+    def _away(self, points: np.ndarray) -> list[np.ndarray]:
+        """Return how far each of `points` (n, d) is from generators that are left, and from removed ones, (n,) each."""
+        return [tree.query(self.whole.wrap(points))[0] for tree in self._trees]
 
     @cached_property
     def _trees(self) -> tuple[scipy.spatial.KDTree, scipy.spatial.KDTree]:
@@ -185,3 +207,24 @@ class Subdomain(Domain):
             f"the domain is a {self}, which is for meshes from which cells were removed; make the mesh in the whole "
             "domain, then remove cells with its subset()"
         )
+
+
+class SphereRegion(Subdomain, Sphere):
+    """Part of a `Sphere`: the domain of a mesh after `Diagram.subset` has removed cells from it.
+
+    As a `Subdomain`; all of its walls are faces towards removed cells, arcs on bisectors of two generators.
+    """
+
+    whole: Sphere
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.area > self.whole.measure * _SINGLE:
+            raise InputError(
+                f"SphereRegion area is {self.area:g}, expected at most that of the sphere, {self.whole.measure:g}"
+            )
+
+    @property
+    def radius(self) -> float:  # type: ignore[override]
+        """Radius of the sphere."""
+        return self.whole.radius

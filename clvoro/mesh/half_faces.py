@@ -100,7 +100,7 @@ class HalfFaceArrays:
     def behind(self, faces: np.ndarray) -> np.ndarray:
         """Return the generators, or their images, behind the half-faces `faces` (k,): (k, d).
 
-        Behind a wall it is the mirror image of the cell's own, on a part of a sphere the generator of the removed cell.
+        Behind a wall it is the mirror image of the cell's own, or the generator of the cell that was removed there.
         """
         d = self.diagram
         neighbors = d.neighbors[faces]

@@ -53,7 +53,7 @@ class MeshOutput:
 
         The cells that are left do not change. Their faces towards removed cells become faces on a boundary. So all
         faces are on bisectors, as models on C grids need it at coasts. The domain of the new mesh is a
-        `clvoro.geometry.subdomain.Subdomain`, on a sphere a `clvoro.geometry.sphere.SphereRegion`.
+        `clvoro.geometry.subdomain.Subdomain`, on a sphere a `clvoro.geometry.subdomain.SphereRegion`.
         `clvoro.earth` finds the cells of oceans and of limited areas on a sphere. Meshes for OpenFOAM of a part
         of a box in 3D keep their short edges.
 

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from functools import partial
-from typing import Any, TypeVar, cast
+from typing import TypeVar, cast
 
 import numpy as np
 
@@ -12,8 +11,7 @@ from ..arguments import format_point, warn
 from ..connectivity import starts_of, take_rows, used_indices
 from ..errors import InputError, InputTypeError, MismatchWarning
 from ..geometry.domain import Domain
-from ..geometry.sphere import COAST, Sphere, SphereRegion
-from ..geometry.subdomain import Subdomain
+from ..geometry.subdomain import COAST, SphereRegion, Subdomain
 from ..geometry.surface import Surface
 from .diagram import Diagram
 from .results import Result, figures
@@ -33,9 +31,7 @@ def take_subset(mesh: Mesh, keep: object, boundary: str | np.ndarray) -> Mesh:
         )
     if kept.all():
         return mesh
-    globe = diagram.domain.globe
-    make: Any = _in_space if globe is None else partial(_on_sphere, sphere=globe)
-    part = make(diagram, kept, boundary)
+    part = _kept(diagram, kept, boundary)
     if not isinstance(mesh, Result):
         return cast("Mesh", part)
     reason = f"{len(part)} of {len(kept)} cells; {mesh.stop_reason}"
@@ -79,7 +75,7 @@ def without_holes(mesh: Result) -> Result:
     if holes is None:
         return mesh
     inside = holes.hole_of(mesh.points)
-    made = _result_of(mesh, _in_space(mesh.diagram, inside < 0, holes.names_of(inside)), inside < 0)
+    made = _result_of(mesh, _kept(mesh.diagram, inside < 0, holes.names_of(inside)), inside < 0)
     faces, domain = made.diagram.faces, made.diagram.domain
     cut = np.flatnonzero(faces.neighbor < 0)
     cut = cut[domain.removed_behind(-1 - faces.neighbor[cut])]
@@ -112,8 +108,8 @@ def check_mask(name: str, mask: object, n: int) -> np.ndarray:
     return array
 
 
-def _in_space(d: Diagram, kept: np.ndarray, boundary: str | np.ndarray) -> Diagram:
-    """Return the kept cells in a box or polygon; faces towards removed cells become walls of a `Subdomain`.
+def _kept(d: Diagram, kept: np.ndarray, boundary: str | np.ndarray) -> Diagram:
+    """Return the kept cells; faces towards removed cells become walls of a `Subdomain`.
 
     `boundary` is the name of these walls, or one for each cell that is removed, (n,) object.
     """
@@ -131,7 +127,9 @@ def _in_space(d: Diagram, kept: np.ndarray, boundary: str | np.ndarray) -> Diagr
     labels = np.broadcast_to(np.asarray(boundary, object), len(d))[np.maximum(behind, 0)]
     old = cut & (behind < 0)
     labels[old] = [d.domain.boundary_names[k] for k in d.domain.boundary_index[-1 - behind[old]]]
-    domain = Subdomain(whole, within, beyond, float(d.volumes[kept].sum()), _names(labels[cut].tolist(), w))
+    names = _names(labels[cut].tolist(), d.domain.boundary_names, w)
+    kind = Subdomain if whole.globe is None else SphereRegion
+    domain = kind(whole, within, beyond, float(d.volumes[kept].sum()), names)
     shifts = np.where(cut[:, None], 0, d.shifts[faces]).astype(np.int8)
     return Diagram(domain, {**_arrays(d, kept, faces, neighbors), "shifts": shifts})
 
@@ -159,38 +157,9 @@ def _arrays(d: Diagram, kept: np.ndarray, faces: np.ndarray, neighbors: np.ndarr
 _CORNERS = {"cell_vertex": "cell_vertices", "face_vertex": "face_vertices"}
 
 
-def _on_sphere(d: Diagram, kept: np.ndarray, boundary: str | np.ndarray, sphere: Sphere) -> Diagram:
-    """Return the kept cells; faces towards removed cells become faces on the boundary."""
-    number = np.cumsum(kept) - 1
-    owner = d.half_faces.owner
-    faces = np.flatnonzero(kept[owner])
-    behind = d.neighbors[faces]
-    lost = (behind >= 0) & ~kept[np.maximum(behind, 0)]
-    former, removed = np.unique(-1 - behind[behind < 0]), np.unique(behind[lost])
-    neighbors = np.where(
-        behind < 0,
-        -1 - np.searchsorted(former, -1 - behind),
-        np.where(lost, -1 - len(former) - np.searchsorted(removed, behind), number[np.maximum(behind, 0)]),
-    )
-    labels = [sphere.boundary_names[k] for k in sphere.boundary_index[former]]
-    labels += np.broadcast_to(np.asarray(boundary, object), len(d))[removed].tolist()
-    beyond = [d.points[removed]]
-    if len(former):
-        beyond.insert(0, sphere.mirrored(former, d.points[:0]))
-    region = SphereRegion(
-        sphere.radius,
-        within=d.points[np.unique(owner[faces[neighbors < 0]])],
-        beyond=np.concatenate(beyond),
-        area=min(float(d.volumes[kept].sum()), Sphere(sphere.radius).measure),
-        names=_names(labels),
-    )
-    return Diagram(region, _arrays(d, kept, faces, neighbors))
-
-
-def _names(labels: list[str], first: int = 0) -> dict[str, list[int]] | None:
-    """Return the walls of each name, numbered from `first` on; those with the default name are left out."""
-    names: dict[str, list[int]] = {}
+def _names(labels: list[str], before: tuple[str, ...], first: int) -> dict[str, list[int]] | None:
+    """Return the walls of each name, numbered from `first` on, names of `before` first; without the default name."""
+    names: dict[str, list[int]] = {name: [] for name in (*before, *labels)}
     for k, label in enumerate(labels):
-        if label != COAST:
-            names.setdefault(label, []).append(first + k)
-    return names or None
+        names[label].append(first + k)
+    return {name: walls for name, walls in names.items() if walls and name != COAST} or None

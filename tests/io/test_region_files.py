@@ -188,19 +188,6 @@ def test_ugrid_has_the_coast(part, tmp_path):
     assert np.array_equal(file["area"], d.volumes)
 
 
-@pytest.mark.parametrize("suffix", ["npz", "vtu"])
-def test_saved_parts_are_loaded(part, tmp_path, suffix):
-    d = part.subset(part.points[:, 0] > -5e6, "open").diagram
-    d.save(tmp_path / f"mesh.{suffix}")
-    again = clvoro.load(tmp_path / f"mesh.{suffix}")
-    assert again.domain == d.domain
-    assert again.domain.boundary_names == d.domain.boundary_names == ("open", "coast")
-    assert np.array_equal(again.domain.boundary_index, d.domain.boundary_index)
-    for name in ("points", "volumes", "neighbors", "vertices", "cell_vertices"):
-        assert np.array_equal(getattr(again, name), getattr(d, name))
-    again.check().demand()
-
-
 def test_damaged_regions_are_refused(part, tmp_path):
     path = tmp_path / "mesh.npz"
     part.save(path)
