@@ -146,6 +146,19 @@ def test_small_faces_that_bulge_out_do_not_thin_layers(adapter):
     assert mesh.check()
 
 
+@pytest.mark.slow
+def test_layers_around_a_wrap_end_in_few_places(adapter):
+    """On the ground, too. Where a cell stays rejected, layers end around it only, and its corners stay."""
+    trimesh = pytest.importorskip("trimesh")
+    blocks = [((0, 0, -1), (2, 1, 2)), ((1, 0.5, -1), (3, 2, 1.2)), ((-2, -2, -1), (-1, 1, 1.5))]
+    town = trimesh.util.concatenate([trimesh.creation.box(bounds=b) for b in blocks])
+    air = Solid.outside(Solid.from_trimesh(town, wrap=0.4, name="town"), ((-3, -3, 0), (4, 3, 3.5)))
+    mesh = adapter.run(air, 0.6, effort="fast", seed=2, layers=Layers(0.06, 3, 1.3, edges=["town", "zMin"]))
+    (told,) = mesh.summary()["thickness"]
+    assert told["mean"] > 0.4 * told["asked"]  # 0.06 where they end as far around all places as around the worst
+    assert mesh.check("openfoam")
+
+
 def test_a_mesh_with_layers_is_a_start(adapter, cube):
     again = adapter.run(
         cube.domain, 0.25, points=cube.points[::-1], layers=Layers(0.02, 3, 1.3, edges=["xMin", "zMax"])

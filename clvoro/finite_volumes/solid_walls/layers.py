@@ -20,7 +20,7 @@ from ...mesh.geometry import sum_rows
 from ...mesh.results import thickness_in_words
 from ..collapse import collapse_short
 from ..gate import judged_thoroughly, rejected_cells
-from .mend import narrow_faces
+from .mend import narrow_faces, spoiled_near_walls, with_neighbors
 from .mesh import diagram_of
 
 if TYPE_CHECKING:
@@ -88,10 +88,10 @@ def add_layers(diagram: Diagram, layers: Sequence[Layers]) -> tuple[Diagram, lis
         if not bad.count:
             break
         if (smoother := walls.without(bad.bulging)) is not walls:
-            share = smoother.smooth(np.minimum(share[smoother.rows_in(walls)], smoother.first_shares()))
+            share = smoother.smooth(np.minimum(share[smoother.row_before], smoother.first_shares()))
             walls = smoother
         else:
-            share = walls.thinner(share, bad.vertices)
+            share = walls.thinner(share, bad)
             attempt += 1
     assert best is not None
     _, made, share, walls = best
@@ -111,11 +111,13 @@ class _RejectedCells:
 
     - `count`: their number.
     - `vertices` (k,) int: those of walls whose layers are to blame.
+    - `corners` (j,) int: vertices of the inner ones in the mesh without layers.
     - `bulging` (f,) bool: small faces of the mesh without layers that make cells concave with them.
     """
 
     count: int
     vertices: np.ndarray
+    corners: np.ndarray
     bulging: np.ndarray
 
 
@@ -136,6 +138,7 @@ class _LayeredWalls:
     - `patch`: (w,) int
     - `starts`, `corners` (w + 1,), (c,) int: vertices around each of `rows`.
     - `vertices` (u,) int: vertices on walls, ascending; the arrays below have a row for each.
+    - `row_before`: (u,) int. The row of each of them, or of the nearest one, before a collapse.
     """
 
     def __init__(self, domain: Domain, faces: Faces, layers: Sequence[Layers]) -> None:
@@ -147,8 +150,8 @@ class _LayeredWalls:
         self.face = rows_of(self.starts)
         self.vertices, place = np.unique(corners, return_inverse=True)
         self.corners = place.reshape(-1)
-        self._last: np.ndarray | None = None
-        self._blamed = np.zeros(len(self.vertices), np.int64)
+        self._last, self.row_before = cast("np.ndarray | None", None), np.arange(len(self.vertices))
+        self._blamed, self._stays = np.zeros(len(self.vertices), np.int64), np.zeros(len(f.points), bool)
         self._read(layers)
         self._meet()
 
@@ -314,20 +317,23 @@ class _LayeredWalls:
                 return np.minimum(share, lower)
             share = np.minimum(share, lower)
 
-    def thinner(self, share: np.ndarray, bad: np.ndarray) -> np.ndarray:
-        """Return the shares (u,), smaller at the vertices `bad` (k,), and around them where they are 0 already.
+    def thinner(self, share: np.ndarray, rejected: _RejectedCells) -> np.ndarray:
+        """Return the shares (u,), smaller at the vertices of `rejected`, and around them where they are 0 already.
 
-        Layers end where vertices have been bad more than `_THINNED` times, each time farther around them.
+        Layers end where vertices have been bad more than `_THINNED` times, each time farther around them. Corners of
+        rejected cells stay where they are from then on.
         """
-        blamed = self._blamed
+        bad, blamed = rejected.vertices, self._blamed
         blamed[bad] += 1
+        leader = self._leader[rejected.corners]
+        self._stays[rejected.corners[(leader >= 0) & (share[leader] == 0)]] = True
         less = share.copy()
         less[bad] *= np.where(blamed[bad] > _THINNED, 0, _THINNER)
-        gone = np.zeros(len(share), bool)
-        gone[bad[share[bad] == 0]] = True
-        for _ in range(max(0, blamed[gone].max(initial=0) - _THINNED - 1)):
-            gone[self.end[gone[self.begin]]] = True
-        less[gone] = 0
+        rings = np.zeros(len(share), np.int64)
+        rings[bad] = np.where(share[bad] == 0, blamed[bad] - _THINNED, 0)
+        for _ in range(rings.max(initial=0) - 1):
+            np.maximum.at(rings, self.end, rings[self.begin] - 1)
+        less[rings > 0] = 0
         return self.smooth(less)
 
     # Vertices that follow.
@@ -379,6 +385,14 @@ class _LayeredWalls:
         return wall
 
     @cached_property
+    def _leader(self) -> np.ndarray:
+        """Row in `vertices` of each vertex of the mesh, or of the one that it follows; -1 for others, (v,)."""
+        wall, (band, leader, _) = self._wall.copy(), self._followers
+        inside = wall[band] < 0
+        wall[band[inside]] = leader[inside]
+        return wall
+
+    @cached_property
     def _links(self) -> scipy.sparse.csr_array:
         """Weights of the neighbors of each vertex that follows, (b, v). Those of walls are on the same walls."""
         f, band, wall = self.faces, self._followers[0], self._wall
@@ -411,13 +425,13 @@ class _LayeredWalls:
         rows, leaders = self._wall[band[on]], near[on]
         links, sums = self._links, np.maximum(self._links.sum(axis=1), 1e-300)
         slides, back = links[on][:, self.vertices], np.where(self._outward, way.T, 0).T
-        whole, above = way.copy(), way.copy()
+        whole, above, stays = way.copy(), way.copy(), self._stays[self.vertices]
         for sweep in range(_SWEEPS + 1):
             for field, source in ((whole, 0), (above, back)):
                 pull = (
                     slides @ (field - source) / sums[on, None] if sweep else weight[on, None] * (way - source)[leaders]
                 )
-                field[rows] = way[rows] + np.einsum("uij,uj->ui", self.along[rows], pull)
+                field[rows] = way[rows] + np.einsum("uij,uj->ui", self.along[rows], pull) * ~stays[rows, None]
         moved[self.vertices] = whole
         inside = np.flatnonzero(self._wall[band] < 0)
         moved[band[inside]] = 0
@@ -432,13 +446,15 @@ class _LayeredWalls:
             )
             moved[band[inside], a] = found
         self._last = moved[band[inside]]
+        moved[self._stays] = 0
         slid = above - way
         rows = np.flatnonzero(np.linalg.norm(slid, axis=1) > 1e-9 * self.sizes)
         walls = x[self.vertices]
         walls[rows] = self._onto_patches(rows, walls[rows] + slid[rows])
         moved += x
         moved[self.vertices] = walls + way + (whole - above)
-        rows = np.flatnonzero(self.border | (~self.column & (whole != above).any(axis=1)))
+        sliding = self.border & whole.any(axis=1) | ~self.column & (whole != above).any(axis=1)
+        rows = np.flatnonzero(sliding)
         moved[self.vertices[rows]] = self._onto_patches(rows, moved[self.vertices[rows]], bare=True)
         return moved, walls
 
@@ -612,17 +628,20 @@ class _LayeredWalls:
         return found & judged
 
     def without(self, bulging: np.ndarray) -> _LayeredWalls:
-        """Return the walls of the mesh without the faces `bulging` (f,) bool, or these walls if none of them can go."""
-        faces = collapse_short(self.faces, None, bulging, suspects=np.zeros(len(bulging), bool))
-        if len(faces) == len(self.faces):
+        """Return the walls of the mesh without those faces `bulging` (f,) bool that can go, or these if none can."""
+        faces, none = self.faces, np.zeros(len(bulging), bool)
+        made = collapse_short(faces, None, bulging, suspects=none)
+        if len(made) < len(faces) and (spoiled := spoiled_near_walls(faces, made) & ~self._rejected_before).any():
+            spoiled = with_neighbors(faces, spoiled)
+            held = spoiled[faces.owner] | spoiled[np.maximum(faces.neighbor, 0)]
+            made = collapse_short(faces, None, bulging & ~held, ~held, none)
+        if len(made) == len(faces):
             return self
-        made = _LayeredWalls(self.solid, faces, self.layers)
-        made._rejected_before, made._blamed = self._rejected_before, self._blamed[made.rows_in(self)]
-        return made
-
-    def rows_in(self, walls: _LayeredWalls) -> np.ndarray:
-        """Return the row of each vertex, or of the nearest one, in `walls` before a collapse, (u,) int."""
-        return scipy.spatial.KDTree(walls.faces.points[walls.vertices]).query(self.faces.points[self.vertices])[1]
+        walls = _LayeredWalls(self.solid, made, self.layers)
+        walls.row_before = _nearest(self.faces.points[self.vertices], made.points[walls.vertices])
+        walls._rejected_before, walls._blamed = self._rejected_before, self._blamed[walls.row_before]
+        walls._stays = self._stays[_nearest(self.faces.points, made.points)]
+        return walls
 
     def rejected(self, made: _Layered) -> _RejectedCells:
         """Return the cells that OpenFOAM rejects because of layers."""
@@ -634,17 +653,15 @@ class _LayeredWalls:
         # The vertices of their prisms, those of bad cells, and those that these follow.
         sides, face = g.sides()
         _, corners = take_rows(g.starts, g.corners, face[core[sides]])
-        wall, (band, leader, _) = self._wall.copy(), self._followers
-        inside = wall[band] < 0
-        wall[band[inside]] = leader[inside]
-        found = wall[distinct(corners)]
+        corners = distinct(corners)
+        found = self._leader[corners]
         of_prisms = self.corners[np.isin(self.face, made.wall[np.flatnonzero(bad[n:])])]
         vertices = distinct(np.concatenate([of_prisms, found[found >= 0]]))
         bad[n:] = False
         part = made.faces.part(around)[0]
         rows, bulging = part.half_face[narrow_faces(part, np.cbrt(part.volumes), bad[around])], np.zeros(len(g), bool)
         bulging[rows[rows >= 0]] = True
-        return _RejectedCells(count, vertices, bulging)
+        return _RejectedCells(count, vertices, corners, bulging)
 
     def reached(self, share: np.ndarray, layers: Sequence[Layers]) -> list[dict[str, float]]:
         """Return how thick the `layers` are; `share` (u,) is that at vertices. Warn where they are thin."""
@@ -673,6 +690,11 @@ class _LayeredWalls:
                     MismatchWarning,
                 )
         return found
+
+
+def _nearest(points: np.ndarray, places: np.ndarray) -> np.ndarray:
+    """Return the row of the nearest of `points` (n, 3) to each of the `places` (k, 3), (k,) int."""
+    return scipy.spatial.KDTree(points).query(places)[1]
 
 
 def _sums(rows: np.ndarray, values: np.ndarray) -> np.ndarray:
