@@ -168,6 +168,21 @@ class InsertionDeletion:
         self._room.clear("keys", "spread", "chosen", "latest")
         return self._apply(present, marks)
 
+    def change_regions(
+        self, present: Present, log_ratio: cla.Array, region: np.ndarray, lacks: np.ndarray
+    ) -> Outcome | None:
+        """Insert and delete in regions of the domain, not next to each other in one call. None if nothing changes.
+
+        - `log_ratio` (n,) real: see `CellSizes`.
+        - `region` (n,) int: that of each cell.
+        - `lacks` (k,) int: how many generators each region lacks; negative: how many are to be deleted.
+        """
+        t, marks = present.t, _Marks.clean(self._room, present.t, self.engine.dim)
+        for k in np.flatnonzero(lacks).tolist():
+            marks.busy[: t.n].set((region != k).astype(np.uint64))
+            self._split_or_delete(present, log_ratio, marks, int(lacks[k]), 1)
+        return self._apply(present, marks)
+
     def split_delete(self, present: Present, sites: tuple[cla.Array, cla.Array]) -> Outcome | None:
         """Split and delete cells at `sites`, each (n,) uint64 and not 0 at sites; otherwise as `insert_delete`."""
         t, marks = present.t, _Marks.clean(self._room, present.t, self.engine.dim)

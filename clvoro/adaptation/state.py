@@ -23,6 +23,7 @@ from ..opencl.engine import Engine
 from ..opencl.primitives import Summaries
 from ..sizing import Sizing
 from ..sizing.field import Field
+from ..solvers.components import Components
 from ..solvers.linear_system import Solution
 from ..tessellation.bins import BinnedPoints
 from ..tessellation.decomposition import distribute, is_balanced
@@ -529,6 +530,32 @@ class MeshState:
                 new = stages.insertion_deletion.split_delete(self.present, sites)
             stages.clear_poisson()
             return new
+
+        stages.clear_poisson()
+        return self._replace_by(changed)
+
+    def balance_regions(self, missing: float, begun: bool) -> tuple[int, int]:
+        """Insert and delete where fixed generators cut regions off; return the numbers of both.
+
+        Faces between fixed generators stay. So no displacement evens out the numbers of cells on both sides of them.
+        Cells next to each other do not change in one call. Calls after the first one go on with what is `begun`.
+
+        - `missing`: how many cells are missing in all. The largest region gets what the others leave.
+        """
+        stages, engine, t = self.stages, self.engine, self.t
+
+        def changed() -> Outcome | None:
+            w = stages.density.cell_weights(t, self.h)
+            held = t.names(engine, self.labels).get() < self.fixed
+            regions = Components(engine, t, held)
+            cells, required, free = regions.sums(None, w.weight, ~held[: self.n])
+            lacks = np.where(free > 0, np.rint(required - cells), 0).astype(int)
+            largest = free.argmax()
+            lacks[largest] = 0
+            if not begun and not lacks.any():
+                return None
+            lacks[largest] = round(missing) - lacks.sum()
+            return stages.insertion_deletion.change_regions(self.present, w.log_ratio, regions.of_cell, lacks)
 
         stages.clear_poisson()
         return self._replace_by(changed)

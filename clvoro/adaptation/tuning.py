@@ -100,6 +100,8 @@ BALANCE_TOLERANCE = 3e-2
 """Relative residual of the potential of a balance."""
 BALANCED_ALONE = 150_000
 """Cells of all parts up to which part 0 balances them alone: its rounds have few cells for each of many messages."""
+MAX_BALANCES = 6
+"""Largest number of calls, one after the other, that insert and delete in regions that fixed generators cut off."""
 
 # Steps and their solves.
 

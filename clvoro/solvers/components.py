@@ -14,12 +14,17 @@ from ..tessellation.device_diagram import Tessellation
 class Components:
     """The components of the diagram `t`, which may be a part of the whole. The work is done on the host.
 
+    The face between two cells that are both `held` (n,) bool, with the ghosts after them, does not connect them.
+
     - `of_cell` (n,) int: number of the component of each cell, the same in all parts.
     """
 
-    def __init__(self, engine: Engine, t: Tessellation) -> None:
+    def __init__(self, engine: Engine, t: Tessellation, held: np.ndarray | None = None) -> None:
         self._engine, peers = engine, engine.peers
         starts, neighbors = t.starts.get(), t.neighbors.get()
+        if held is not None:
+            inner = np.flatnonzero(neighbors[: starts[-1]] >= 0)
+            neighbors[inner[held[neighbors[inner]] & held[rows_of(starts)[inner]]]] = -1
         self.of_cell = connected_components(starts, neighbors)
         self._count = int(self.of_cell.max(initial=-1)) + 1
         if t.part is None or t.part.peers is None:

@@ -1,4 +1,4 @@
-"""Numbers of generators in parts of a polygon that a neck joins: the choice against a reference, and the outcome."""
+"""Numbers of generators in parts that a neck joins, against a reference, or that fixed generators cut off."""
 
 import numpy as np
 import pyopencl as cl
@@ -28,8 +28,9 @@ DOMAINS = {
 
 
 def grid(corner, size, counts, rng):
-    """Return an irregular lattice of generators in a rectangle."""
-    at = np.indices(counts).reshape(2, -1).T + 0.5 + rng.uniform(-0.2, 0.2, (np.prod(counts), 2))
+    """Return an irregular lattice of generators in a rectangle or box."""
+    d = len(counts)
+    at = np.indices(counts).reshape(d, -1).T + 0.5 + rng.uniform(-0.2, 0.2, (np.prod(counts), d))
     return np.array(corner) + at / counts * size
 
 
@@ -41,7 +42,7 @@ def unbalanced(left, right, pieces=False):
 
 
 def make_mesh(ctx, domain, points, fixed=0, real=np.float64, peers=ALONE, labels=None):
-    engine = Engine(ctx, cl.CommandQueue(ctx), 2, np.dtype(real), domain.traits(np.dtype(real)), peers=peers)
+    engine = Engine(ctx, cl.CommandQueue(ctx), domain.dim, np.dtype(real), domain.traits(np.dtype(real)), peers=peers)
     on_device = engine.upload(domain.place(points, engine.real))
     sizing = Sizing(engine, domain, as_field(H))
     return patch.make_mesh(Stages(engine), domain, sizing, on_device, fixed=fixed, labels=labels)
@@ -113,6 +114,29 @@ def test_choice_of_parts(ctx, monkeypatch, name, most):
     (labels, found, exchanges), other = Team(2).run(work)
     assert np.array_equal(np.concatenate([found, other[1]]), expected[np.concatenate([labels, other[0]])])
     assert (exchanges < 10) == (most > 0)
+
+
+def test_fixed_generators_cut_regions_off(ctx):
+    """Between two layers of fixed generators faces stay: each side gets its cells, of 156 and 204."""
+    box, rng = clvoro.Box((0, 0, 0), (1, 0.6, 0.6)), np.random.default_rng(44)
+    layers = [(x, *yz) for x in (0.45, 0.55) for yz in 0.05 + 0.1 * np.indices((6, 6)).reshape(2, -1).T]
+    size = 0.4, 0.6, 0.6
+    free = grid((0, 0, 0), size, (4, 6, 5), rng), grid((0.6, 0, 0), size, (4, 7, 6), rng)
+    points = np.concatenate([layers, *free])
+
+    def work(peers):
+        rows = np.array_split(np.argsort(points[:, 1]), peers.count)[peers.number]
+        mesh, begun = make_mesh(ctx, box, points[rows], len(layers), peers=peers, labels=rows), False
+        while mesh.balance_regions(mesh.missing_cells(), begun) != (0, 0):
+            begun = True
+        return mesh.to_host(mesh.points, mesh.domain.frame[1]) + mesh.domain.frame[0]
+
+    x, in_parts = work(ALONE), np.concatenate(Team(2).run(work))
+    assert [(x[:, 0] < 0.5).sum(), (x[:, 0] > 0.5).sum()] == pytest.approx([180, 180], abs=1)
+    assert np.sort(in_parts, axis=0) == pytest.approx(np.sort(x, axis=0), abs=1e-9)
+    # Where faces can move, generators do, and nothing else is changed.
+    mesh = make_mesh(ctx, box, np.concatenate([layers[:36], *free]), fixed=36)
+    assert mesh.balance_regions(mesh.missing_cells(), begun=False) == (0, 0)
 
 
 def in_both(mesh):

@@ -98,14 +98,16 @@ def test_cells_at_a_sharp_tip_may_have_few_faces(ctx):
     assert result.diagram.volumes.sum() == pytest.approx(cone.measure, rel=0.06)
 
 
-def test_cells_in_teeth_that_hold_no_whole_number_keep_their_shapes(ctx):
+def test_teeth_that_stations_cut_off_get_their_number_of_cells(ctx):
     turn = np.pi / 6 * (np.arange(3)[:, None] + [0.02, 0.14, 0.36, 0.48]).ravel()
     teeth = np.tile([0.75, 1.0, 1.0, 0.75], 3)[:, None] * np.column_stack([np.cos(turn), np.sin(turn)])
     gear = clvoro.Solid.extruded(clvoro.Polygon([*teeth, (0.08, 0.29), (0.3, 0)]), 0, 0.4)
-    result = clvoro.Adapter(ctx).run(gear, 0.1, seed=2)
-    # With one scale of log(L / h) the projection pushes these cells against others: 0.30 and 0.21.
+    result = clvoro.Adapter(ctx).run(gear, 0.1)
+    # By the number of all cells alone, teeth have 13 to 17 cells in place of 15: .014 and .16.
+    assert np.abs(result.size_error).mean() < 3e-3
+    assert np.abs(result.size_error).max() < 0.05
+    # With one scale of log(L / h) the projection pushes cells against others: .30.
     assert result.quality.min() > 0.4
-    assert np.abs(result.size_error).max() < 0.15
 
 
 def test_what_solids_do_not_have_is_refused(ctx):

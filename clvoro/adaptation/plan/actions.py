@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Protocol
 
 from ..estimates import MOST_SURPLUS
 from ..motion import Displacement, Method
-from ..tuning import CLIMB_STRAIN, LEAST_PROGRESS, MAX_OSCILLATIONS, SAMPLING_GAIN
+from ..tuning import CLIMB_STRAIN, LEAST_PROGRESS, MAX_BALANCES, MAX_OSCILLATIONS, SAMPLING_GAIN
 
 if TYPE_CHECKING:
     from ..run import Run
@@ -180,6 +180,17 @@ class BalanceCounts:
     def apply(self, run: Run) -> None:
         """Insert and delete them."""
         run.state.balance_counts()
+
+
+@dataclass(frozen=True)
+class BalanceRegions:
+    """Insert and delete cells until each region that fixed generators cut off has its number of them."""
+
+    def apply(self, run: Run) -> None:
+        """Insert and delete them."""
+        for turn in range(MAX_BALANCES if run.state.fixed else 0):
+            if run.state.balance_regions(missing(run), begun=turn > 0) == (0, 0):
+                break
 
 
 @dataclass(frozen=True)

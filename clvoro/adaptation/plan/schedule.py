@@ -20,9 +20,10 @@ In 3D there is no lattice with dislocations. Each level glides, then polishes:
 
     density start ─► [ couple ─► correct count ahead ] x 2 ─► couple ─► glide ─► polish ─► correct count ahead
         ─► refine ─► ...
-        ─► couple ─► correct count (─► couple) ─► glide ─► polish (─► project)
+        ─► balance regions ─► couple ─► correct count ─► balance regions (─► couple) ─► glide ─► polish (─► project)
 
 *correct count ahead*  to the number from which refinement gives that of the next level, where it seldom has to change
+*balance regions*      each region that fixed generators cut off gets its number of cells
 
 Where the number of given points is far from that of the sizes, points of a density start replace them, and the run
 begins on the finest level.
@@ -48,6 +49,7 @@ from ..motion import Method
 from .actions import (
     Action,
     BalanceCounts,
+    BalanceRegions,
     CorrectCount,
     CountOfMesh,
     InsertDelete,
@@ -288,6 +290,8 @@ def _adaptive_3d(effort: Effort, levels: int, exact: bool, error_target: float, 
             yield Refine()
         elif not warm:
             yield from couple * effort.start
+        if not level:
+            yield BalanceRegions()
         if level:
             for steps in (effort.couple, effort.recouple):
                 yield from couple * steps
@@ -301,6 +305,7 @@ def _adaptive_3d(effort: Effort, levels: int, exact: bool, error_target: float, 
             yield CorrectCount(tuning.COUNT_LEAST, ahead=1.0)
     yield from couple * effort.couple_finest
     yield CorrectCount(tuning.COUNT_FINEST_3D[exact] if levels else tuning.COUNT_LEAST)
+    yield BalanceRegions()
     for k in range(effort.couple_finest):
         yield replace(couple[0], recent=k + 1 if levels else 0)
     yield CorrectCount()
