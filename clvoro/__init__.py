@@ -1,7 +1,8 @@
 """Voronoi meshes that meet a size field, adapted with OpenCL.
 
-You give a domain and the size h(x) of its cells (edge lengths, in the domain's unit). The generators of a Voronoi
-diagram are moved, inserted and deleted until its cells have that size and are nearly regular.
+You give a domain and the size h(x) of its cells: the square root of their areas, in space the cube root of their
+volumes. The generators of a Voronoi diagram are moved, inserted and deleted until its cells have that size and are
+nearly regular.
 
 >>> import clvoro
 >>> from clvoro import sizing

@@ -627,7 +627,8 @@ class Polygon(Domain):
         return find_narrow_parts(self, size)
 
     remedy_for_narrow_parts = (
-        "Use smaller sizes there, as sizing.FeatureSize does, or fill it: domain.simplified(size) does"
+        "Use smaller sizes there, as sizing.FeatureSize does, or fill it: domain.simplified(size) does, and simplified "
+        "= SIZE in a case"
     )
 
     def why_sizes_are_missed(self, x: np.ndarray, h: float, cells: int) -> str:
@@ -643,7 +644,7 @@ class Polygon(Domain):
             )
         return (
             "narrow parts of the domain do not hold a whole number of cells of this size: use smaller sizes there, as "
-            "sizing.FeatureSize does, or fill them: domain.simplified(size) does"
+            "sizing.FeatureSize does, or fill them: domain.simplified(size) does, and simplified = SIZE in a case"
         )
 
     @property

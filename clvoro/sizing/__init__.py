@@ -1,4 +1,4 @@
-"""Size fields h(x), the target edge length of a cell, and their evaluation.
+"""Size fields h(x), the target width of a cell (root of its area or volume), and their evaluation.
 
 `Sizing.evaluate` (evaluation.py, kernel `evaluate_size` in size_field.cl) evaluates h on the device.
 

@@ -166,18 +166,6 @@ def test_netcdf_has_walls_and_names(meshed, tmp_path) -> None:
     assert about["flag_values"].tolist() == list(range(5))
 
 
-@pytest.mark.sparse(6)
-@pytest.mark.parametrize("suffix", [".npz", ".vtu"])
-def test_files_keep_walls_and_names(meshed, tmp_path, suffix) -> None:
-    _, _, result = meshed
-    result.save(tmp_path / f"mesh{suffix}")
-    again = clvoro.load(tmp_path / f"mesh{suffix}").diagram
-    assert again.domain == result.diagram.domain
-    assert again.domain.boundary_names == result.diagram.domain.boundary_names
-    assert np.array_equal(again.domain.boundary_index, result.diagram.domain.boundary_index)
-    assert np.array_equal(again.neighbors, result.diagram.neighbors)
-
-
 @pytest.mark.sparse(2)
 def test_cell_data_have_the_boundary_of_the_largest_face(meshed) -> None:
     _, edges, result = meshed

@@ -282,13 +282,6 @@ def result_of(domain: clvoro.Polygon) -> clvoro.Result:
     )
 
 
-def test_files_hold_the_domain(tmp_path) -> None:
-    domain = clvoro.Polygon.from_pieces([[star(40)[::-1], star(9, radius=0.1)], [SQUARE + np.pi]])
-    path = tmp_path / "mesh.npz"
-    result_of(domain).save(path)
-    assert clvoro.load(path).diagram.domain == domain
-
-
 def test_checkpoints_tell_domains_apart() -> None:
     from clvoro.adaptation.checkpoint import domain_fingerprint
 

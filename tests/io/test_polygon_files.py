@@ -255,24 +255,6 @@ def test_measures(result) -> None:
 # Files.
 
 
-def same_diagram(one, other) -> None:
-    assert one.domain == other.domain
-    for name in one._arrays:
-        assert np.array_equal(getattr(one, name), getattr(other, name)), name
-
-
-@pytest.mark.sparse(2)
-@pytest.mark.parametrize("name", list(DOMAINS))
-def test_npz_keeps_everything(ctx, tmp_path, name: str) -> None:
-    made = mesh(ctx, DOMAINS[name](), 40)
-    made.save(tmp_path / "mesh.npz")
-    again = clvoro.load(tmp_path / "mesh.npz")
-    same_diagram(made.diagram, again.diagram)
-    assert again.check().ok
-    made.save(tmp_path / "twice.npz")
-    assert (tmp_path / "mesh.npz").read_bytes() == (tmp_path / "twice.npz").read_bytes()
-
-
 @pytest.mark.sparse(2)
 @pytest.mark.parametrize("name", list(DOMAINS))
 def test_vtu_is_read_back(ctx, tmp_path, name: str) -> None:

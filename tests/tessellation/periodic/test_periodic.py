@@ -9,7 +9,6 @@ from scipy.spatial import Voronoi, cKDTree
 import clvoro
 from clvoro import sizing
 from clvoro.errors import InputError, InputTypeError
-from clvoro.io.vtu_read import load_vtu
 from clvoro.mesh.quality import measure_mesh
 from clvoro.opencl import program as _program
 from clvoro.tessellation.device_diagram import read_report
@@ -448,20 +447,6 @@ def test_too_few_cells_for_a_run(double):
 
 
 # Files, pictures, cases.
-
-
-@pytest.mark.parametrize("box", [UNIT, CHANNEL, SLAB], ids=["unit", "channel", "slab"])
-@pytest.mark.parametrize("kind", ["npz", "vtu"])
-def test_files(double, tmp_path, box, kind):
-    points = some_points(box, 500 if box.dim == 3 else 60)
-    result = double.run(box, 0.3, points=points, method="lloyd", max_steps=0)
-    path = tmp_path / f"mesh.{kind}"
-    result.save(path)
-    read = clvoro.load(path) if kind == "npz" else load_vtu(path)
-    assert read.diagram.domain == box
-    assert read.check()
-    assert faces_of(read.diagram).keys() == faces_of(result.diagram).keys()
-    assert (read.points == result.points).all()
 
 
 def test_one_cell_that_borders_on_itself(double):
