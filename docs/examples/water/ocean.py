@@ -82,7 +82,7 @@ faces = ocean.diagram.faces
 coast = faces.boundary == ocean.diagram.domain.boundary_names.index("coast")
 print(f"{faces.area[coast].sum() / 1e3:,.0f} km of coast")
 
-ocean.plot("size", projection="plate")
+ocean.plot("quality", projection="plate")
 
 # %%
 # In the file for MPAS, 0 stands for missing cells beyond the coast.
