@@ -141,13 +141,15 @@ class Chunks:
         self.groups = np.empty(n, np.int32)
         self.groups[self.order] = np.repeat(np.arange(len(self.firsts)), self.sizes)
 
+    def places(self, chosen: np.ndarray) -> np.ndarray:
+        """Return where in `order` the generators of the `chosen` chunks are, chunk by chunk."""
+        ends = np.cumsum(self.sizes[chosen])
+        first = np.repeat(self.firsts[chosen] - ends + self.sizes[chosen], self.sizes[chosen])
+        return np.arange(len(first)) + first
+
     def rows(self, chosen: np.ndarray) -> np.ndarray:
         """Return the generators of the `chosen` chunks, chunk by chunk."""
-        ends = np.cumsum(self.sizes[chosen])
-        if not len(ends):
-            return np.empty(0, int)
-        first = np.repeat(self.firsts[chosen] - ends + self.sizes[chosen], self.sizes[chosen])
-        return self.order[np.arange(ends[-1]) + first]
+        return self.order[self.places(chosen)]
 
 
 class BallGroups:
@@ -163,9 +165,10 @@ class BallGroups:
 
     def __init__(self, centers: np.ndarray, radii: np.ndarray, chunks: Chunks) -> None:
         self.centers, self.radii, self.chunks = centers, radii.copy(), chunks
-        x, radii, firsts = np.take(centers, chunks.order, axis=0), radii[chunks.order], chunks.firsts
+        radii, firsts = radii[chunks.order], chunks.firsts
+        self.axes = np.ascontiguousarray(np.take(centers, chunks.order, axis=0).T)
         self.largest = np.maximum.reduceat(radii, firsts)
-        self.boxes = np.hstack([f.reduceat(x, firsts, axis=0) for f in (np.minimum, np.maximum)])
+        self.boxes = np.column_stack([f.reduceat(x, firsts) for f in (np.minimum, np.maximum) for x in self.axes])
         self.facts = np.column_stack([self.boxes, self.largest, SKIN * np.minimum.reduceat(radii, firsts)])
 
     def facing(self, facts: np.ndarray) -> Facing:
@@ -176,31 +179,33 @@ class BallGroups:
         ways, limits = gaps(self.boxes[near], boxes), NEAR * np.maximum.outer(self.largest[near], largest)
         chosen, beside = np.nonzero(ways <= limits)
         away[near] = np.min(ways, axis=1, where=ways > limits, initial=FARTHEST)
-        # Pairs of each ball in these groups with all boxes beside its group.
+        # Pairs of each ball in these groups with all boxes beside its group, the first box of each group at first.
         counts = np.bincount(chosen, minlength=len(near))
         begins, meet = np.cumsum(counts) - counts, np.flatnonzero(counts)
-        balls, sizes = self.chunks.rows(near[meet]), self.chunks.sizes[near[meet]]
-        if not len(balls):
-            return Facing(facts, away, balls, np.empty(0), balls, balls, np.empty(0))
-        first, count = np.repeat(begins[meet], sizes), np.repeat(counts[meet], sizes)
-        ends = np.cumsum(count)
-        pairs = np.arange(ends[-1]) + np.repeat(first - ends + count, count)
-        places, others, limits = np.repeat(balls, count), beside[pairs], limits[chosen, beside][pairs]
-        ways2 = np.zeros(len(places))
-        for axis in range(dim):
-            x = self.centers[places, axis]
-            gap = np.maximum(boxes[others, axis] - x, x - boxes[others, dim + axis])
-            ways2 += np.square(np.maximum(gap, 0, out=gap))
-        ways = np.sqrt(ways2)
-        close = ways <= limits
-        apart = np.minimum.reduceat(np.where(close, FARTHEST, ways), ends - count)
-        apart = np.minimum(apart, np.repeat(away[near[meet]], sizes))
-        return Facing(facts, away, balls, apart, places[close], others[close], ways[close])
+        sizes = self.chunks.sizes[near[meet]]
+        rows = self.chunks.places(near[meet])
+        axes, apart, found = self.axes[:, rows], np.repeat(away[near[meet]], sizes), []
+        for turn in range(counts.max(initial=0)):
+            more = counts[meet] > turn
+            pairs, count = begins[meet[more]] + turn, sizes[more]
+            there = np.arange(len(rows)) if more.all() else np.flatnonzero(np.repeat(more, sizes))
+            ways2 = np.zeros(len(there))
+            for axis, x in enumerate(axes if more.all() else axes[:, there]):
+                gap = np.maximum(np.repeat(boxes[beside[pairs], axis], count) - x, 0)
+                np.maximum(gap, x - np.repeat(boxes[beside[pairs], dim + axis], count), out=gap)
+                ways2 += np.square(gap, out=gap)
+            ways = np.sqrt(ways2, out=ways2)
+            close = ways <= np.repeat(limits[chosen[pairs], beside[pairs]], count)
+            far = there[~close]
+            apart[far] = np.minimum(apart[far], ways[~close])
+            found.append((there[close], np.repeat(beside[pairs], count)[close], ways[close]))
+        pairs = [np.concatenate(arrays) for arrays in zip(*found, strict=True)] if found else [rows] * 3
+        return Facing(facts, away, self.chunks.order[rows], apart, *pairs)
 
     def meeting(self, facing: Facing) -> np.ndarray:
         """Return which balls, with their skins, meet a box in which the other part has generators, (m,) int."""
-        found = facing.places[facing.ways <= (1 + SKIN) * self.radii[facing.places]]
-        return found[np.diff(found, prepend=-1) != 0]
+        near = facing.ways <= (1 + SKIN) * self.radii[facing.balls[facing.places]]
+        return facing.balls[np.unique(facing.places[near])]
 
 
 @dataclass(frozen=True)
@@ -211,7 +216,7 @@ class Facing:
     - `away` (k,) float: lower bound of the distance of the centers of a group from the boxes with which it has no
       pairs. This distance is also at least `NEAR` times the largest radius in such a box.
     - `balls`, `apart` (b,) int, float: the balls of groups with pairs, and the same bound for each of them.
-    - `places`, `others`, `ways` (p,) int, int, float: pairs of a ball and a box in the order of `balls`, and the
+    - `places`, `others`, `ways` (p,) int, int, float: pairs of a ball, by its place in `balls`, and a box; and the
       distances of the ball's center from this box.
     """
 
@@ -282,7 +287,7 @@ def around(boxes: np.ndarray) -> np.ndarray:
 
 def _tree(points: np.ndarray) -> scipy.spatial.cKDTree:
     """Return a tree of `points` (n, d), of few of which the nearest are sought: half the time of a balanced one."""
-    return scipy.spatial.cKDTree(points, compact_nodes=False, balanced_tree=False)
+    return scipy.spatial.cKDTree(points, leafsize=24, compact_nodes=False, balanced_tree=False)
 
 
 def inside(points: np.ndarray, balls: np.ndarray) -> np.ndarray:
@@ -290,10 +295,10 @@ def inside(points: np.ndarray, balls: np.ndarray) -> np.ndarray:
 
     The center of a ball with radius r gets one more coordinate, sqrt(R^2 - r^2), where R is the largest radius; that of
     a point is 0. A point is then in the ball if it is nearer than R to the center. Searches are slow if most radii are
-    much smaller than R. So each search has balls whose r^2 are within a factor of two.
+    much smaller than R. So each search has balls whose r are within a factor of four.
     """
     found = np.zeros(len(points), bool)
-    classes = np.frexp(np.square(balls[:, -1]))[1]
+    classes = np.frexp(balls[:, -1])[1] // 2
     for same in np.unique(classes):
         centers, rest = balls[classes == same], np.flatnonzero(~found)
         radii, places = centers[:, -1].copy(), np.column_stack([points[rest], np.zeros(len(rest))])
@@ -403,7 +408,7 @@ class PartSteps(DomainSteps):
         self._sides, self._rows = np.empty(0, int), np.empty(0, np.int32)
         self._share_landmarks(x)
         self._caps = FIRST_REACH[self.domain.cell_dim] * self._chunks.spacings
-        self._take(self._ask(x, self._caps, self._caps))
+        self._take(self._ask(x, self._caps, np.zeros(len(x))))
 
     def _share_landmarks(self, x: np.ndarray) -> None:
         """Let all parts know the generators nearest to the landmarks of the domain; `x` (n, d) are own ones."""
@@ -762,12 +767,9 @@ class PartSteps(DomainSteps):
             share = 1 - max(grown[side] / NEAR, FREE)
             rooms = np.maximum(ways - np.maximum(largest.max(), FREE * ways), share * ways)
             rooms = np.maximum(skins.min(), rooms)
-            if len(f.places):
-                firsts = np.flatnonzero(np.diff(f.places, prepend=-1))
-                rows, skin, largest = places[f.places[firsts]], skins[f.others], largest[f.others]
-                rooms_there = np.maximum(skin, f.ways - np.maximum(largest, FREE * f.ways))
-                ways[rows] = np.minimum(ways[rows], np.minimum.reduceat(f.ways, firsts))
-                rooms[rows] = np.minimum(rooms[rows], np.minimum.reduceat(rooms_there, firsts))
+            rows, skin, largest = places[f.balls[f.places]], skins[f.others], largest[f.others]
+            np.minimum.at(ways, rows, f.ways)
+            np.minimum.at(rooms, rows, np.maximum(skin, f.ways - np.maximum(largest, FREE * f.ways)))
             rooms[places[self._sent[side]]] = np.inf
             free, room = np.minimum(free, FREE * ways), np.minimum(room, rooms)
         rows = np.where(places, places, groups)
