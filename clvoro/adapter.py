@@ -444,12 +444,13 @@ class Adapter:
         effort : "fast", "default" or "best"
             Amount of work of "adaptive", "exact" and "transport".
         points : (n, d) array of float, "density" or "uniform"
-            Generators to start from: those of the array, random ones with density h^-d, or uniform random ones as in
-            the paper. From an array, "adaptive" and "exact" only correct and polish a mesh that nearly has the sizes
-            already (mean |e| up to 0.15, count off by 2 % at most, cells as good as after a run with this effort), as
-            after the size field has moved by a few cells; see `MultilevelOptions`. From any other array they run all
-            levels. Where its number of points is far from that of the sizes, random ones replace them, unless `options`
-            has levels.
+            Generators to start from: those of the array, ones with density h^-d, or uniform random ones as in the
+            paper. Those with density h^-d are random or, from 1,000 cells of the same size in space on, a body-centered
+            cubic lattice in a random direction, unless `options` has levels. From an array, "adaptive" and "exact" only
+            correct and polish a mesh that nearly has the sizes already (mean |e| up to 0.15, count off by 2 % at most,
+            cells as good as after a run with this effort), as after the size field has moved by a few cells; see
+            `MultilevelOptions`. From any other array they run all levels. Where its number of points is far from that
+            of the sizes, random ones replace them, unless `options` has levels.
         method : str
             "adaptive" goes from coarse to fine, inserts and deletes generators, and ends with good cells of the right
             size. "exact" gives every cell its target size, to about 1e-4; "transport" to 1e-10 (float32: 1e-3), in a

@@ -28,10 +28,10 @@ from .plan.actions import Action, Prescribe
 from .plan.efforts import NEAR_COUNT, NEAR_ERROR, choose_error_target, is_near, steep_share
 from .plan.schedule import Begins, adaptive_schedule, auto_levels, repeated_schedule
 from .sampling.quadrature import DensityTree
-from .sampling.start import charted, density_tree, replace_far, sample_density, sample_uniform
+from .sampling.start import charted, density_tree, replace_far, sample_density, sample_lattice, sample_uniform
 from .stages import Stages
 from .state import MeshState, Setup
-from .tuning import CELLS_ACROSS, GRADIENT_STEP, LEAST_STEEP, MOVES, NEAR_SIZE, OPENINGS, SAMPLED_SIZES, STEPS
+from .tuning import CELLS_ACROSS, GRADIENT_STEP, LATTICE, LEAST_STEEP, MOVES, NEAR_SIZE, OPENINGS, SAMPLED_SIZES, STEPS
 
 _APART = 0.7
 """Least distance of generators around concave creases from those beside surfaces inside, over h."""
@@ -61,7 +61,7 @@ class Prepared:
     layout: Layout
     count: CellCount
     lattice: np.ndarray | None
-    """(n, d) ndarray or None. Generators at the start of a moving mesh."""
+    """(n, d) ndarray or None. Generators at the start of a moving mesh, or where sizes are the same."""
     levels: int
     """Number of coarser levels."""
     kept_rows: np.ndarray | None
@@ -120,13 +120,26 @@ def prepare(stages: Stages, arguments: RunArguments, max_levels: int | None = No
     most = max(count.target, 0 if points is None else len(points))
     check_memory(stages.engine, most, domain)  # before creases have generators
     setup = _set_up(stages, layout, sizing, count, fixed, options)
-    lattice = lattice_points(domain, count.target) if options.method in MOVING else None
-    levels = _count_levels(setup, points, count.target, len(layout.layers.points), options) if options.multilevel else 0
+    lattice = _lattice(setup, layout, count, options) if points is None else None
+    levels = 0
+    if options.multilevel and lattice is None:
+        levels = _count_levels(setup, points, count.target, len(layout.layers.points), options)
     if options.levels == "auto" and max_levels is not None:
         levels = min(levels, max_levels)
     check_prisms(layout.layers.prisms(lambda x: count.factor * sizing(x)))
     memory = _estimate_memory(setup, options, count, most, levels)
     return Prepared(options, setup, points, layout, count, lattice, levels, kept_rows, memory)
+
+
+def _lattice(setup: Setup, layout: Layout, count: CellCount, options: Options) -> np.ndarray | None:
+    """Return the lattice (n, d) that a run without given points starts from, if there is one."""
+    domain, tree = setup.domain, count.tree
+    if options.method in MOVING:
+        return lattice_points(domain, count.target)
+    chosen = options.start != "density" or options.levels != "auto" or not options.multilevel
+    if chosen or tree is None or count.target < LATTICE[domain.cell_dim] or not tree.is_uniform:
+        return None
+    return sample_lattice(setup.free, count.target - len(layout.layers.points), options.seed)
 
 
 def _set_up(
@@ -400,6 +413,9 @@ def without_far(prepared: Prepared, max_levels: int | None = None) -> Prepared:
     if len(rows):
         new = np.full(len(points) - len(rows), -1)
         return replace(prepared, points=points, kept_rows=np.concatenate([before[rows], new]))
+    lattice = _lattice(setup, prepared.layout, prepared.count, options)
+    if lattice is not None:
+        return replace(prepared, points=None, kept_rows=None, lattice=lattice, levels=0)
     levels = _count_levels(setup, None, prepared.count.target, len(prepared.layout.layers.points), options)
     levels = levels if max_levels is None else min(levels, max_levels)
     # Points are drawn for the coarsest level from the tree as it was.
@@ -411,7 +427,8 @@ def judge_points(prepared: Prepared, mesh: MeshState) -> tuple[Beginning, Prepar
     """Return how the run uses the points of the caller, whose mesh is `mesh`, and the run without far ones."""
     options, n = prepared.options, mesh.total
     if prepared.points is None or not options.multilevel:
-        return Beginning("random" if prepared.points is None else "mesh"), prepared
+        drawn: Begins = "random" if prepared.lattice is None else "lattice"
+        return Beginning(drawn if prepared.points is None else "mesh"), prepared
     s = mesh.summaries.read()
     mean, quality = s["error"].magnitude / n, s["quality"].sum / n
     missing = mesh.missing_cells() if options.n_cells is None else float(options.n_cells - n)
@@ -425,7 +442,8 @@ def judge_points(prepared: Prepared, mesh: MeshState) -> tuple[Beginning, Prepar
     if options.levels == "auto" and (after := without_far(prepared)) is not prepared:
         if after.points is None:
             return Beginning(
-                "random", f"the given points are all far from the sizes, and were replaced ({found})"
+                "random" if after.lattice is None else "lattice",
+                f"the given points are all far from the sizes, and were replaced ({found})",
             ), after
         assert after.kept_rows is not None
         share = f"{1 - np.count_nonzero(after.kept_rows >= 0) / len(prepared.points):.0%} of the given points are"

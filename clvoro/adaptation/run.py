@@ -613,4 +613,4 @@ def _prepared(stages: Stages, arguments: RunArguments, max_levels: int | None, b
 
 def _replaces(arguments: RunArguments, beginning: Beginning) -> bool:
     """Return whether random points replace some of those of the caller, or all."""
-    return arguments.points is not None and beginning.begins in ("random", "partly random")
+    return arguments.points is not None and beginning.begins in ("random", "lattice", "partly random")

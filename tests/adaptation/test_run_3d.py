@@ -72,6 +72,17 @@ def test_figures_of_adaptive_runs(adapter, adapter32, dtype, options, mean, larg
     assert (result.converged, result.stop_reason) == (True, "plan completed")
 
 
+def test_runs_at_a_constant_size_start_from_a_lattice(adapter):
+    """Its cells have Q = 0.753, those of random starts about 0.71."""
+    box = clvoro.Box((0, 0, 0), (1, 1, 1), periodic=True)
+    lattice, random = (
+        adapter.run(box, 0.09, "fast", options=options) for options in (None, clvoro.MultilevelOptions(levels=0))
+    )
+    assert lattice.quality.mean() > 0.735 > 0.73 > random.quality.mean()
+    assert np.abs(lattice.size_error).mean() < 0.003
+    assert len(lattice.history) < len(random.history)
+
+
 def test_refinement_gives_the_number_of_the_next_level(adapter):
     """Few generators are inserted or deleted on the finest level, and cells are coupled again only after that."""
     result = adapter.run(BOX, S1, options=clvoro.MultilevelOptions(levels=1), seed=3)

@@ -25,6 +25,11 @@ In 3D there is no lattice with dislocations. Each level glides, then polishes:
 *correct count ahead*  to the number from which refinement gives that of the next level, where it seldom has to change
 *balance regions*      each region that fixed generators cut off gets its number of cells
 
+Where sizes are the same in the whole domain, generators of a body-centered cubic lattice are the start, on the finest
+level:
+
+    lattice ─► couple ─► correct count ─► couple ─► correct count ─► glide ─► polish (─► project)
+
 Where the number of given points is far from that of the sizes, points of a density start replace them, and the run
 begins on the finest level.
 
@@ -60,8 +65,8 @@ from .actions import (
 )
 from .efforts import EFFORTS_OF, Effort, choose_error_target
 
-Begins = Literal["random", "mesh", "partly random", "near"]
-"""What a run begins with: random points, a mesh, a mesh with some random points, or a mesh that is near its sizes."""
+Begins = Literal["random", "lattice", "mesh", "partly random", "near"]
+"""What a run begins with: random points, a lattice, a mesh, a mesh with some random points, or one near its sizes."""
 COUPLE = WeightedMethod(cautious=True, tolerance=0.2, max_cycles=1)
 """Weighted steps after refinement, and all in 3D: one cycle of multigrid; the next steps reduce what remains."""
 
@@ -92,8 +97,9 @@ def adaptive_schedule(
     - `effort`: one of `EFFORTS`.
     - `exact`: end with the exact projection.
     - `error_target`: by default that of `choose_error_target` for smooth sizes.
-    - `begins` "random", "mesh", "partly random" or "near": what the run begins with: random points, a mesh, a mesh in
-      which random points replace some, or a mesh that only needs a correction (see `is_near`), without coarser levels.
+    - `begins` "random", "lattice", "mesh", "partly random" or "near": what the run begins with: random points, a
+      lattice, a mesh, a mesh in which random points replace some, or a mesh that only needs a correction (see
+      `is_near`). A lattice and such a mesh have no coarser levels.
     - `openings`: how often the last steps open obtuse triangles, at most. Some steps before them cells of four sides
       are deleted, and those of eight split: a cell of four sides has an obtuse triangle.
     - `narrow_parts`: the domain, in 2D, may have parts that few cells join. The number of cells in each part is then
@@ -297,7 +303,10 @@ def _adaptive_3d(effort: Effort, levels: int, exact: bool, error_target: float, 
                 yield from couple * steps
                 yield CorrectCount(tuning.COUNT_LEAST, tuning.POLISH_GROWTH_3D)
             yield from couple * effort.recouple
-        if level or (not levels and begins != "mesh"):
+        if begins == "lattice":
+            yield from [Step(coarse_glide)] * max(effort.alone // 2 - effort.glide, 0)
+            yield ResetMomentum()
+        elif level or (not levels and begins != "mesh"):
             yield from [Step(coarse_glide)] * (effort.coarse_glide if levels else effort.alone)
             yield from [Step(coarse_polish)] * effort.coarse_polish
             yield ResetMomentum()

@@ -110,6 +110,11 @@ class DensityTree:
         """Sum of the error estimates, in cells."""
         return float(self._errors.sum())
 
+    @property
+    def is_uniform(self) -> bool:
+        """Whether h is the same in the whole domain, to one percent."""
+        return bool(self._high.max() <= 1.01 * self._low.min())
+
     def sizes(self, points: np.ndarray) -> np.ndarray:
         """Return h at `points` (n, d), (n,) float64.
 

@@ -1,7 +1,8 @@
-"""Random generators with the density of a size field, in a domain or in the chart of a curved one."""
+"""Generators with the density of a size field: random ones, or a lattice where sizes are the same."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from numbers import Integral, Real
 from typing import Any, Protocol, runtime_checkable
@@ -51,6 +52,8 @@ _ULPS = 4  # least distance of points from the boundary of a polygon
 _MAX_BOXES = 1 << 15  # over a polygon, for uniform points
 _MAX_EXPECTED = 1.0  # points per box
 _TOLERANCE = 1e-3  # relative error of the integral in the tree for sampling
+_DEPTH = 0.05  # least distance of a lattice's points from walls, over their spacing
+_CUBE = 6.0  # side of cubes of a lattice's points, over their spacing
 
 
 def count_cells(field: Callable[[np.ndarray], np.ndarray] | float, domain: Domain, tolerance: float = 1e-4) -> float:
@@ -180,6 +183,49 @@ def sample_uniform(domain: Domain, n: int, seed: int, real: DTypeLike = np.float
         return place(len(rows))
 
     return _in_all_pieces(domain, _distinct(draw, domain, np.empty((0, domain.dim)), n, np.dtype(real)))
+
+
+def sample_lattice(domain: Domain, n: int, seed: int) -> np.ndarray:
+    """Return the points inside of a body-centered cubic lattice in a random position, about `n`, (m, 3) float64.
+
+    Its cells are the best known ones for a constant size in space (Barnes and Sloane, SIAM J. Algebraic Discrete
+    Methods 4, 1983): Q is 0.753.
+
+    - `domain`: in space, flat.
+    - `seed`: seed of numpy's PCG64.
+    """
+    n, seed = _check_arguments(n, seed)
+    rng = np.random.Generator(np.random.PCG64(seed))
+    axes, shift = np.linalg.qr(rng.standard_normal((3, 3)))[0], rng.random(3)
+    spacing = (domain.measure / n) ** (1 / 3)
+    edge, middle = 2 ** (1 / 3) * spacing, (np.array(domain.lower) + domain.upper) / 2
+    steps = np.arange(math.ceil(np.linalg.norm(domain.extent) / 2 / edge) + 2)
+    steps = np.concatenate([-steps[:0:-1], steps])
+    layer = np.stack(np.meshgrid(steps, steps, [0.0, 0.5], indexing="ij"), axis=-1).reshape(-1, 3)
+    layer[:, :2] += layer[:, 2:]
+    found = []
+    for z in steps:  # one layer at a time: the lattice is some times as large as the domain
+        x = middle + edge * (layer + shift + (0, 0, z)) @ axes.T
+        found.append(x[((x > domain.lower) & (x < domain.upper)).all(axis=1)])
+    points = np.concatenate(found)
+    return _in_all_pieces(domain, points[_contained(domain, points, spacing)])
+
+
+def _contained(domain: Domain, points: np.ndarray, spacing: float) -> np.ndarray:
+    """Return for each of `points` (n, d) whether it is inside and off the boundary, (n,) bool.
+
+    Only points in cubes that meet walls are examined one by one.
+    """
+    side = _CUBE * spacing
+    places = np.floor((points - domain.lower) / side).astype(np.int64)
+    shape = places.max(axis=0, initial=0) + 1
+    cubes, cube = np.unique(np.ravel_multi_index(tuple(places.T), tuple(shape)), return_inverse=True)
+    lower = domain.lower + side * np.stack(np.unravel_index(cubes, tuple(shape)), axis=1)
+    inside = domain.contains(lower + side / 2)
+    found = inside[cube]
+    near = np.flatnonzero(domain.meets_wall(lower, lower + side)[cube])
+    found[near] = domain.contains_well(points[near], _DEPTH * spacing)
+    return found
 
 
 @runtime_checkable

@@ -4,11 +4,12 @@ import math
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from clvoro import Solid, sizing
 from clvoro.adaptation.sampling.box_tree import BoxTree, hilbert_tables
 from clvoro.adaptation.sampling.quadrature import DensityTree
-from clvoro.adaptation.sampling.start import _distinct, count_cells, sample_density, sample_uniform
+from clvoro.adaptation.sampling.start import _distinct, count_cells, sample_density, sample_lattice, sample_uniform
 from clvoro.errors import InputError, InputTypeError
 from clvoro.geometry.box import Box
 from clvoro.opencl.engine import Engine
@@ -247,6 +248,37 @@ def test_uniform_is_plain_uniform():
     # 15 bins of 1333 each, standard deviation 35: plain random points scatter, but not by 4 of it.
     assert np.abs(counts - 20000 / 15).max() < 4 * 35.3
     assert np.std(counts) > 10
+
+
+@pytest.mark.parametrize("name", ["box", "two balls", "torus", "outside"])
+def test_lattices_fill_domains(name):
+    """All points are off the walls, each has eight neighbors at the same distance, and others are farther."""
+    domains = {
+        "box": Box((1, 2, 3), (2, 4, 3.5)),
+        "two balls": Solid.ball((0, 0, 0), 1) + Solid.ball((3, 0, 0), 0.3),
+        "torus": Solid.torus((0, 0, 0), 1, 0.4),
+        "outside": Solid.outside(Solid.ball((0, 0, 0), 0.5), Box((-1, -1, -1), (1, 1, 1))),
+    }
+    domain, n = domains[name], 8000
+    points = sample_lattice(domain, n, 3)
+    spacing = (domain.measure / n) ** (1 / 3)
+    assert domain.contains_well(points, 0.05 * spacing).all()
+    # Points near walls are left out: a layer of 0.05 spacings, and their number scatters.
+    assert len(points) == pytest.approx(n, rel=0.03)
+    assert len(np.unique(domain.piece_of(points))) == domain.n_pieces
+    inner = domain.contains_well(points, 1.2 * spacing)
+    assert inner.any()
+    near = cKDTree(points).query(points[inner], k=10)[0][:, 1:]
+    edge = 2 ** (1 / 3) * spacing
+    assert np.allclose(near[:, :8], edge * 3**0.5 / 2, rtol=1e-9)
+    assert near[:, 8] == pytest.approx(edge)
+    assert np.array_equal(points, sample_lattice(domain, n, 3))
+    assert not np.array_equal(points, sample_lattice(domain, n, 4))
+
+
+@pytest.mark.parametrize(("size", "uniform"), [("0.05", True), ("0.05 + 0.0003*x", True), ("0.05 + 0.01*x", False)])
+def test_uniform_sizes_are_noticed(size, uniform):
+    assert DensityTree(sizing.Expression(size), CUBE).is_uniform == uniform
 
 
 @pytest.mark.sparse(2)
