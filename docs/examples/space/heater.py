@@ -23,7 +23,7 @@ print({name: round(float(v), 4) for name, v in zip(d.region_names, volumes, stri
 # %%
 # Half of the room. Faces lie on the surfaces: each cell is on one side of them.
 
-mesh.plot(d.cell_region, view="cutaway", cut="y", through=(0.5, 0.5, 0.5))
+mesh.plot(d.cell_region, label="region", view="cutaway", cut="y", through=(0.5, 0.5, 0.5))
 
 # %%
 # In OpenFOAM each region is a zone of cells, and each surface a zone of faces. `splitMeshRegions -cellZones` then makes

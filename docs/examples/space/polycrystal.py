@@ -31,7 +31,7 @@ for relax in (0, 10):
     roundness = 36 * np.pi * grains.volumes**2 / surface**3
     print(f"relax={relax}: volumes to {off:.0e}, {faces.mean():.1f} faces, mean roundness {roundness.mean():.3f}")
     ax.hist(roundness, bins=30, histtype="step", label=f"relax={relax}")
-ax.set(xlabel="36 pi V^2 / S^3", ylabel="grains")
+ax.set(xlabel=r"$36 \pi V^2 / S^3$", ylabel="grains")
 ax.legend()
 
 # %%
