@@ -215,6 +215,16 @@ def test_walls_cut_off_as_much_as_they_add(made):
     assert off[1] < off[0] + 1e-2 * H
 
 
+def test_vertices_are_no_farther_from_a_ball_than_plane_polygons_need(ctx):
+    """A regular hexagon that cuts off as much as it adds has corners 7 / (36 sqrt(3)) A kappa off, A its area."""
+    ball = clvoro.Solid.ball((0, 0, 0), 1, edge=0.06)
+    f = clvoro.Adapter(ctx).run(ball, 0.25, effort="fast").faces
+    walls = np.unique(f.corners[f.starts[f.n_inner] :])
+    off, area = np.linalg.norm(f.points[walls], axis=1) - 1, f.area[f.n_inner :]
+    assert off.mean() == pytest.approx(7 / (36 * np.sqrt(3)) * area.mean(), rel=0.1)
+    assert 0 < off.min() < off.max() < 7 / (36 * np.sqrt(3)) * 1.2 * area.max()
+
+
 def plane_errors(faces):
     """Return the largest distance of the corners of each face between cells from its plane, (f,)."""
     center, vector = faces.vectors
