@@ -65,8 +65,9 @@ NOISE = {"float64": 1e-6, "float32": 1e-4}
 FILLED, MATCHED = {"float64": 1e-8, "float32": 1e-3}, {"float64": 1e-5, "float32": 1e-3}
 """`FILLED`: largest relative difference between the volume of all cells and that of the domain. `MATCHED`: largest
 relative difference between the measures of faces between parts, seen from both sides."""
-GROUP = 64
-"""Number of balls in each group of the balls that another part has sent."""
+GROUP, BLOCK = 64, 16
+"""Number of balls in each group of the balls that another part has sent. Number of successive chunks in a block: chunks
+are compared in blocks that are near each other."""
 MENDED, WIDER = (256, 0.02), 1.2
 """Largest number of generators that get other limits without asking for all anew, and as a share of all if that is
 more. Radius of their balls over the needed one."""
@@ -174,17 +175,26 @@ class BallGroups:
     def facing(self, facts: np.ndarray) -> Facing:
         """Return how far these balls are from the boxes of another part, which has sent its `facts` (k, 2 d + 2)."""
         boxes, largest, dim = facts[:, :-2], facts[:, -2], self.centers.shape[1]
-        away = gaps(self.boxes, around(boxes))[:, 0]
-        near = np.flatnonzero(away <= NEAR * np.maximum(self.largest, largest.max()))
-        ways, limits = gaps(self.boxes[near], boxes), NEAR * np.maximum.outer(self.largest[near], largest)
-        chosen, beside = np.nonzero(ways <= limits)
-        away[near] = np.min(ways, axis=1, where=ways > limits, initial=FARTHEST)
+        blocks, large = around(self.boxes), np.maximum.reduceat(self.largest, _blocks(self.largest))
+        blocks_there, large_there = around(boxes), np.maximum.reduceat(largest, _blocks(largest))
+        ways, limits = gaps(blocks[:, None], blocks_there), NEAR * np.maximum.outer(large, large_there)
+        away = np.repeat(np.min(ways, axis=1, where=ways > limits, initial=FARTHEST), BLOCK)[: len(self.boxes)]
+        # Pairs of groups in blocks that are near each other.
+        near, within = np.nonzero(ways <= limits), np.divmod(np.arange(BLOCK**2), BLOCK)
+        chosen = np.add.outer(BLOCK * near[0], within[0]).ravel()
+        beside = np.add.outer(BLOCK * near[1], within[1]).ravel()
+        order = np.flatnonzero((chosen < len(away)) & (beside < len(boxes)))
+        order = order[np.argsort(chosen[order], kind="stable")]
+        chosen, beside = chosen[order], beside[order]
+        ways, limits = gaps(self.boxes[chosen], boxes[beside]), NEAR * np.maximum(self.largest[chosen], largest[beside])
+        np.minimum.at(away, chosen, np.where(ways > limits, ways, FARTHEST))
+        close = ways <= limits
+        chosen, beside, limits = chosen[close], beside[close], limits[close]
         # Pairs of each ball in these groups with all boxes beside its group, the first box of each group at first.
-        counts = np.bincount(chosen, minlength=len(near))
+        counts = np.bincount(chosen, minlength=len(away))
         begins, meet = np.cumsum(counts) - counts, np.flatnonzero(counts)
-        sizes = self.chunks.sizes[near[meet]]
-        rows = self.chunks.places(near[meet])
-        axes, apart, found = self.axes[:, rows], np.repeat(away[near[meet]], sizes), []
+        sizes, rows = self.chunks.sizes[meet], self.chunks.places(meet)
+        axes, apart, found = self.axes[:, rows], np.repeat(away[meet], sizes), []
         for turn in range(counts.max(initial=0)):
             more = counts[meet] > turn
             pairs, count = begins[meet[more]] + turn, sizes[more]
@@ -195,12 +205,12 @@ class BallGroups:
                 np.maximum(gap, x - np.repeat(boxes[beside[pairs], dim + axis], count), out=gap)
                 ways2 += np.square(gap, out=gap)
             ways = np.sqrt(ways2, out=ways2)
-            close = ways <= np.repeat(limits[chosen[pairs], beside[pairs]], count)
+            close = ways <= np.repeat(limits[pairs], count)
             far = there[~close]
             apart[far] = np.minimum(apart[far], ways[~close])
             found.append((there[close], np.repeat(beside[pairs], count)[close], ways[close]))
-        pairs = [np.concatenate(arrays) for arrays in zip(*found, strict=True)] if found else [rows] * 3
-        return Facing(facts, away, self.chunks.order[rows], apart, *pairs)
+        of_pairs = [np.concatenate(arrays) for arrays in zip(*found, strict=True)] if found else [rows] * 3
+        return Facing(facts, away, self.chunks.order[rows], apart, *of_pairs)
 
     def meeting(self, facing: Facing) -> np.ndarray:
         """Return which balls, with their skins, meet a box in which the other part has generators, (m,) int."""
@@ -270,19 +280,25 @@ class Answers:
 
 
 def gaps(boxes: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """Return the distances between `boxes` (k, 2 d) and `others` (m, 2 d), (k, m)."""
-    dim, ways2 = boxes.shape[1] // 2, np.zeros((len(boxes), len(others)))
+    """Return the distances between `boxes` (..., 2 d) and `others` (..., 2 d), of shapes that broadcast."""
+    dim, ways2 = boxes.shape[-1] // 2, np.zeros(np.broadcast_shapes(boxes.shape[:-1], others.shape[:-1]))
     for axis in range(dim):
-        below = np.subtract.outer(boxes[:, axis], others[:, dim + axis])
-        above = np.subtract.outer(boxes[:, dim + axis], others[:, axis])
-        ways2 += np.square(np.maximum(np.maximum(below, np.negative(above, out=above), out=below), 0, out=below))
+        gap = np.maximum(boxes[..., axis] - others[..., dim + axis], 0)
+        np.maximum(gap, others[..., axis] - boxes[..., dim + axis], out=gap)
+        ways2 += np.square(gap, out=gap)
     return np.sqrt(ways2, out=ways2)
 
 
+def _blocks(values: np.ndarray) -> np.ndarray:
+    """Return where blocks of `BLOCK` of `values` (k, ...) begin."""
+    return np.arange(0, len(values), BLOCK)
+
+
 def around(boxes: np.ndarray) -> np.ndarray:
-    """Return the box around all `boxes` (k, 2 d), (1, 2 d)."""
-    dim = boxes.shape[1] // 2
-    return np.concatenate([boxes[:, :dim].min(axis=0), boxes[:, dim:].max(axis=0)])[None]
+    """Return boxes around blocks of `BLOCK` of the `boxes` (k, 2 d)."""
+    dim, firsts = boxes.shape[1] // 2, _blocks(boxes)
+    lower = np.minimum.reduceat(boxes[:, :dim], firsts, axis=0)
+    return np.hstack([lower, np.maximum.reduceat(boxes[:, dim:], firsts, axis=0)])
 
 
 def _tree(points: np.ndarray) -> scipy.spatial.cKDTree:
@@ -620,7 +636,7 @@ class PartSteps(DomainSteps):
                 if number == own and not self._images[way].any():
                     continue
                 side, centers = ways * (number + 1) - 1 - way, asked[:, :-2] - self._shifts[way]
-                near = gaps(np.tile(centers, 2), balls.boxes) - most < asked[:, -1:]
+                near = gaps(np.tile(centers, 2)[:, None], balls.boxes) - most < asked[:, -1:]
                 if kind:
                     near[np.isin(asked[:, -2], self._rows[self._sides == side])] = False
                 which, chunks = np.nonzero(near)
@@ -736,7 +752,7 @@ class PartSteps(DomainSteps):
         firsts = np.arange(0, len(balls), GROUP)
         lower = np.minimum.reduceat(balls[:, :dim] - balls[:, dim:], firsts, axis=0)
         groups = np.hstack([lower, np.maximum.reduceat(balls[:, :dim] + balls[:, dim:], firsts, axis=0)])
-        near = (gaps(own.boxes, groups) <= 0).any(axis=1)[own.chunks.groups]
+        near = (gaps(own.boxes[:, None], groups) <= 0).any(axis=1)[own.chunks.groups]
         near[known] = False
         rows = np.flatnonzero(near)
         places = own.centers[rows]

@@ -15,7 +15,9 @@ from clvoro.opencl.threads import Team
 from clvoro.solvers import multigrid
 from clvoro.solvers.linear_system import Limits
 from clvoro.solvers.volume_projection import Penalty, Targets
+from clvoro.tessellation import part_steps
 from clvoro.tessellation.part import Ghosts, Part
+from clvoro.tessellation.part_steps import NEAR, BallGroups, Chunks
 from clvoro.tessellation.tessellator import Tessellator
 from tests.reference import patch
 
@@ -392,3 +394,27 @@ def test_a_periodic_box_that_is_not_folded(ctx, dim, real):
             assert outcome.converged
         one, other = (correction.get() for correction in corrections)
         assert np.abs(one - other).max() < 1e-4 * np.abs(other).max(), "derivatives are in single precision"
+
+
+def test_balls_and_boxes_of_two_parts(monkeypatch):
+    """Pairs are all that are near each other, and bounds hold for the others; few distances are computed."""
+    rng, found, gaps = np.random.default_rng(5109), [], part_steps.gaps
+    monkeypatch.setattr(part_steps, "gaps", lambda *boxes: found.append(gaps(*boxes)) or found[-1])
+    x = (np.indices((200, 200)).reshape(2, -1).T + rng.random((40_000, 2))) / 200
+    halves, radii = (x[x.sum(axis=1) < 1], x[x.sum(axis=1) >= 1]), rng.uniform(0.01, 0.02, len(x))
+    balls, others = (BallGroups(half, radii[: len(half)], Chunks(half, 1e-4)) for half in halves)
+    facing = balls.facing(others.facts)
+    assert sum(map(np.size, found)) < len(balls.boxes) * len(others.boxes) / 3
+    corners, groups = np.tile(halves[0], 2), balls.chunks.groups
+    ways = gaps(corners[facing.balls, None], others.boxes)
+    paired = np.zeros(ways.shape, bool)
+    paired[facing.places, facing.others] = True
+    assert np.array_equal(ways[paired], facing.ways[np.lexsort((facing.others, facing.places))])
+    limits = np.maximum.outer(balls.largest[groups[facing.balls]], others.largest)
+    assert np.array_equal(paired, ways <= NEAR * limits)
+    assert (facing.apart <= ways.min(axis=1, where=~paired, initial=np.inf)).all()
+    alone = np.setdiff1d(np.arange(len(balls.boxes)), groups[facing.balls])
+    assert (facing.away[alone] <= gaps(balls.boxes[alone, None], others.boxes).min(axis=1)).all()
+    assert (facing.away[alone] > NEAR * np.maximum(balls.largest[alone], others.largest.max()) / 2).all()
+    near = np.flatnonzero((ways <= 1.25 * radii[facing.balls, None]).any(axis=1))
+    assert np.array_equal(np.sort(balls.meeting(facing)), np.sort(facing.balls[near]))
