@@ -214,8 +214,9 @@ class BallGroups:
 
     def meeting(self, facing: Facing) -> np.ndarray:
         """Return which balls, with their skins, meet a box in which the other part has generators, (m,) int."""
-        near = facing.ways <= (1 + SKIN) * self.radii[facing.balls[facing.places]]
-        return facing.balls[np.unique(facing.places[near])]
+        meets = np.zeros(len(facing.balls), bool)
+        meets[facing.places[facing.ways <= (1 + SKIN) * self.radii[facing.balls[facing.places]]]] = True
+        return facing.balls[meets]
 
 
 @dataclass(frozen=True)
@@ -315,7 +316,8 @@ def inside(points: np.ndarray, balls: np.ndarray) -> np.ndarray:
     """
     found = np.zeros(len(points), bool)
     classes = np.frexp(balls[:, -1])[1] // 2
-    for same in np.unique(classes):
+    classes -= classes.min(initial=0)
+    for same in np.flatnonzero(np.bincount(classes)):
         centers, rest = balls[classes == same], np.flatnonzero(~found)
         radii, places = centers[:, -1].copy(), np.column_stack([points[rest], np.zeros(len(rest))])
         largest = radii.max()
