@@ -116,7 +116,8 @@ def warn_of_errors(result: Result, size: Callable[[np.ndarray], np.ndarray]) -> 
     if mean < max(MEAN_ERROR, aimed or 0.0) and largest < LARGEST_ERROR:
         return
     diagram, sizes = result.diagram, result.target_size
-    wanted, made = (float(sizes[worst]), float(diagram.volumes[worst]) ** (1 / diagram.domain.cell_dim))
+    wanted = float(sizes[worst])
+    made = max(float(diagram.volumes[worst]), 0.0) ** (1 / diagram.domain.cell_dim)  # a cell may be inverted
     if len(diagram) == 1 and 2 * made**diagram.domain.cell_dim < wanted**diagram.domain.cell_dim:
         return  # `CoarseSizeWarning` says it before the run
     place = diagram.domain.place_name(result.points[worst])

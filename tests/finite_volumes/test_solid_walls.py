@@ -12,7 +12,7 @@ from scipy.spatial import ConvexHull
 
 import clvoro
 from clvoro.connectivity import following
-from clvoro.errors import InputError
+from clvoro.errors import InputError, MismatchWarning
 from clvoro.finite_volumes.solid_walls import balance, mend
 from clvoro.finite_volumes.solid_walls.cures import Cures
 from clvoro.finite_volumes.solid_walls.editing import judge
@@ -218,11 +218,20 @@ def test_walls_cut_off_as_much_as_they_add(made):
 def test_vertices_are_no_farther_from_a_ball_than_plane_polygons_need(ctx):
     """A regular hexagon that cuts off as much as it adds has corners 7 / (36 sqrt(3)) A kappa off, A its area."""
     ball = clvoro.Solid.ball((0, 0, 0), 1, edge=0.06)
-    f = clvoro.Adapter(ctx).run(ball, 0.25, effort="fast").faces
+    f = clvoro.Adapter(ctx).run(ball, 0.25, effort="fast").diagram.faces
     walls = np.unique(f.corners[f.starts[f.n_inner] :])
     off, area = np.linalg.norm(f.points[walls], axis=1) - 1, f.area[f.n_inner :]
     assert off.mean() == pytest.approx(7 / (36 * np.sqrt(3)) * area.mean(), rel=0.1)
     assert 0 < off.min() < off.max() < 7 / (36 * np.sqrt(3)) * 1.2 * area.max()
+
+
+def test_few_rejected_cells_are_cured_in_a_sheet_half_as_thick_as_a_cell(ctx):
+    """Though they are a large share: the mesh has no inverted cell, and the warning of sizes no negative one."""
+    sheet = clvoro.Polygon([(0, 0), (1.6, 0), (1.6, 0.2), (0.2, 0.2), (0.2, 1.4), (0, 1.4)])
+    with pytest.warns(MismatchWarning, match=r"of the walls are nearer than a cell|narrower than half a cell"):
+        mesh = clvoro.Adapter(ctx).run(clvoro.Solid.extruded(sheet, 0, 1.2), 0.4, effort="fast")
+    failed = {c.name for c in mesh.check("openfoam").criteria if c.demanded and not c.ok}
+    assert failed <= {"determinant"}  # of `checkMesh -allGeometry` only: all faces between cells are upright there
 
 
 def plane_errors(faces):

@@ -48,8 +48,8 @@ _SLIVER, _TIP, _FEW = 0.05, 0.4, 4
 others. So may up to `_FEW` cells without faces to others."""
 _TIP_AREA = 0.2
 """Wall polygons with a smaller area, over h^2, may be joined with others where they are skewed."""
-_TOO_MANY = 0.2
-"""Share of rejected cells above which no cure is tried: the solid is as thin as a cell."""
+_TOO_MANY, _TRIED = 0.2, 40
+"""Share of rejected cells above which no cure is tried, as the solid is as thin as a cell, unless they are so few."""
 _BUDGET, _MOST = 12, 1000
 """Most changes of a rejected cell before others have their turn, and most searches for cures in meshes that are made
 one after another."""
@@ -582,11 +582,11 @@ def cured(
 ) -> tuple[Faces, np.ndarray, np.ndarray, np.ndarray, Cures | None]:
     """Cure the `rejected` cells (k,) of a mesh where that works. If `oblique` cells (k,) are given, mend their faces.
 
-    The mesh stays as it is if cures would leave more cells rejected. `earlier` cures are those of an earlier mesh of
-    the solid; see `Cures`. Return the mesh; which of the given cells each of its cells was; `own` and the cells that
-    are still rejected, as in `_Made`; and the cures. `tell` is called with the work and how far it is.
+    The mesh stays as it is if cures would leave more cells rejected, or no cells. `earlier` cures are those of an
+    earlier mesh of the solid; see `Cures`. Return the mesh; which of the given cells each of its cells was; `own` and
+    the cells that are still rejected, as in `_Made`; and the cures. `tell` is called with the work and how far it is.
     """
-    if len(rejected) > _TOO_MANY * faces.n_cells:
+    if len(rejected) > max(_TRIED, _TOO_MANY * faces.n_cells):
         return faces, np.arange(faces.n_cells), own, rejected, None
     begun = (rejected if oblique is None else oblique).tolist()
     cures = Cures(surface, faces, names, sizes, earlier, oblique is not None)
@@ -597,7 +597,7 @@ def cured(
         cures.branches = branches
         cures.work_on(begun)
     made, cells, left = cures.result(rejected)
-    if len(left) > len(rejected):
+    if len(left) > len(rejected) or not len(cells):
         return faces, np.arange(faces.n_cells), own, rejected, None
     origin = np.array([cures.edits.origins.get(c, c) for c in cells.tolist()])
     is_own = (cells < len(own)) & np.append(own, np.zeros(cures.edits.next_cell, bool))[cells]
