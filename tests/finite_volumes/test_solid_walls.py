@@ -517,9 +517,9 @@ def test_generators_at_walls_settle(ctx, monkeypatch, first):
     assert np.array_equal(made(CellTargets(volumes, held, first))[0].points, x)
 
 
-@pytest.mark.parametrize(("enough", "meshes"), [((1, 180), 1), ((0.005, 180), 2), ((0.005, 0), 6), ((0, 180), 6)])
+@pytest.mark.parametrize(("enough", "meshes"), [((1, 180), 1), ((0.005, 180), 2), ((0.005, 0), 9), ((0, 180), 9)])
 def test_settling_stops_when_sizes_and_angles_are_good(ctx, monkeypatch, enough, meshes):
-    """Otherwise it makes a mesh before each of five steps, and one after them."""
+    """Otherwise it makes a mesh before each of eight steps, and one after them."""
     monkeypatch.setattr("clvoro.finite_volumes.solid_walls.settling._ENOUGH", enough)
     solid = clvoro.Solid.box((0, 0, 0), (1, 1, 1))
     x, h = generators(solid), np.full(64, H)

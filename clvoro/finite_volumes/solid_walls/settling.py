@@ -19,10 +19,10 @@ from ...mesh.faces import Faces
 from .mend import with_neighbors
 from .wall_surface import WallSurface
 
-_STEPS, _MOST = 5, 25_000
+_STEPS, _MOST = 8, 25_000
 """Largest number of steps, and largest product of the number of steps and that of cells: each step makes a mesh of all
 cells, and of many cells few are at walls."""
-_EXACT_STEPS, _LEAST = 12, 2
+_EXACT_STEPS, _LEAST = 24, 2
 """Largest number of steps by the exact method, and that of many cells."""
 _ENOUGH, _EXACT_ENOUGH = (0.0015, 2.0), (0.0008, 2.0)
 """No further step follows if mean size error and mean angle of faces, in degrees, are at most these near walls."""
