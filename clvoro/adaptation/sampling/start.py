@@ -53,7 +53,7 @@ _MAX_BOXES = 1 << 15  # over a polygon, for uniform points
 _MAX_EXPECTED = 1.0  # points per box
 _TOLERANCE = 1e-3  # relative error of the integral in the tree for sampling
 _DEPTH = 0.05  # least distance of a lattice's points from walls, over their spacing
-_CUBE = 6.0  # side of cubes of a lattice's points, over their spacing
+_CUBE = 4.0  # side of cubes of a lattice's points, over their spacing
 
 
 def count_cells(field: Callable[[np.ndarray], np.ndarray] | float, domain: Domain, tolerance: float = 1e-4) -> float:
@@ -214,16 +214,15 @@ def sample_lattice(domain: Domain, n: int, seed: int) -> np.ndarray:
 def _contained(domain: Domain, points: np.ndarray, spacing: float) -> np.ndarray:
     """Return for each of `points` (n, d) whether it is inside and off the boundary, (n,) bool.
 
-    Only points in cubes that meet walls are examined one by one.
+    Only points in cubes that reach a wall are examined one by one.
     """
     side = _CUBE * spacing
     places = np.floor((points - domain.lower) / side).astype(np.int64)
     shape = places.max(axis=0, initial=0) + 1
     cubes, cube = np.unique(np.ravel_multi_index(tuple(places.T), tuple(shape)), return_inverse=True)
-    lower = domain.lower + side * np.stack(np.unravel_index(cubes, tuple(shape)), axis=1)
-    inside = domain.contains(lower + side / 2)
-    found = inside[cube]
-    near = np.flatnonzero(domain.meets_wall(lower, lower + side)[cube])
+    middle = domain.lower + side * (np.stack(np.unravel_index(cubes, tuple(shape)), axis=1) + 0.5)
+    found = domain.contains_well(middle, side * 3**0.5 / 2)[cube]
+    near = np.flatnonzero(~found)
     found[near] = domain.contains_well(points[near], _DEPTH * spacing)
     return found
 

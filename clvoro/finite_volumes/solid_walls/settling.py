@@ -125,10 +125,12 @@ def settled(
     """
     steps = _MOST // max(len(points), 1)
     steps = int(np.clip(steps, _LEAST, _EXACT_STEPS)) if targets.first else min(steps, _STEPS)
+    if not steps:
+        return points
     good, most = points, np.zeros(len(points))
     stays = surface.at_concave_creases(points, sizes) | ~surface.touches(points, _REACH * sizes)
     stays[: targets.fixed] = stays[surface.thin_parts(points, sizes)[0]] = True
-    for step in range(steps + _CHECKS if steps else 0):
+    for step in range(steps + _CHECKS):
         made = make(points)
         if step == 0:
             if np.count_nonzero(made.worst > 1) > _FEW * len(points):
