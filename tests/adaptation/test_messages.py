@@ -33,7 +33,7 @@ def mesh(ctx):
         (lambda a: a.run("part.stl", 0.1), "clvoro.Solid.read(domain)"),
         (lambda a: a.run(BOX, 0.1, np.array(RING)), "the effort third"),
         (lambda a: a.run(BOX, 0.1, method=np.array(RING)), "expected one of adaptive"),
-        (lambda a: sizing.gradient_size(a, np.arange(30)), "gradient_size(values, on=mesh)"),
+        (lambda _: sizing.gradient_size(np.arange(30)), "gradient_size(values, on=mesh)"),
         (lambda a: sizing.Region(0.1, RING), "such as Region("),
         (lambda a: sizing.Distance([(0, 1)], 0.1, 1.2), "Circle(p, radius=0) for a point p"),
         (lambda a: sizing.Distance(np.array(RING), 0.1, 1.2), "Polyline(points) for a line"),
