@@ -61,12 +61,14 @@ class Prepared:
     layout: Layout
     count: CellCount
     lattice: np.ndarray | None
-    """(n, d) ndarray or None. Generators at the start of a moving mesh, or where sizes are the same."""
+    """(n, d) ndarray or None. Generators at the start of a moving mesh."""
     levels: int
     """Number of coarser levels."""
     kept_rows: np.ndarray | None
     """(n,) int or None. For each of `points` its index in those of the caller, or -1; None if all are those of the
     caller."""
+    drawn: Begins
+    """"random" or "lattice": what generators are at the start where the caller gives none."""
     memory: float
     """Estimated device memory of the run, or of reading its diagram, in bytes."""
 
@@ -120,26 +122,23 @@ def prepare(stages: Stages, arguments: RunArguments, max_levels: int | None = No
     most = max(count.target, 0 if points is None else len(points))
     check_memory(stages.engine, most, domain)  # before creases have generators
     setup = _set_up(stages, layout, sizing, count, fixed, options)
-    lattice = _lattice(setup, layout, count, options) if points is None else None
+    lattice = lattice_points(domain, count.target) if options.method in MOVING else None
+    drawn = _drawn(domain, count, options)
     levels = 0
-    if options.multilevel and lattice is None:
+    if options.multilevel and (points is not None or drawn == "random"):
         levels = _count_levels(setup, points, count.target, len(layout.layers.points), options)
     if options.levels == "auto" and max_levels is not None:
         levels = min(levels, max_levels)
     check_prisms(layout.layers.prisms(lambda x: count.factor * sizing(x)))
     memory = _estimate_memory(setup, options, count, most, levels)
-    return Prepared(options, setup, points, layout, count, lattice, levels, kept_rows, memory)
+    return Prepared(options, setup, points, layout, count, lattice, levels, kept_rows, drawn, memory)
 
 
-def _lattice(setup: Setup, layout: Layout, count: CellCount, options: Options) -> np.ndarray | None:
-    """Return the lattice (n, d) that a run without given points starts from, if there is one."""
-    domain, tree = setup.domain, count.tree
-    if options.method in MOVING:
-        return lattice_points(domain, count.target)
-    chosen = options.start != "density" or options.levels != "auto" or not options.multilevel
-    if chosen or tree is None or count.target < LATTICE[domain.cell_dim] or not tree.is_uniform:
-        return None
-    return sample_lattice(setup.free, count.target - len(layout.layers.points), options.seed)
+def _drawn(domain: Domain, count: CellCount, options: Options) -> Begins:
+    """Return what a run without given points begins with: a lattice where many cells have the same size in space."""
+    free = options.multilevel and options.start == "density" and options.levels == "auto"
+    many = free and count.tree is not None and count.target >= LATTICE[domain.cell_dim]
+    return "lattice" if many and count.tree.is_uniform else "random"  # type: ignore[union-attr]
 
 
 def _set_up(
@@ -379,12 +378,14 @@ def start(prepared: Prepared) -> MeshState:
 
 
 def _sample(prepared: Prepared) -> np.ndarray:
-    """Return random generators of the coarsest level."""
+    """Return the generators of the coarsest level, where the caller gives none."""
     setup, options = prepared.setup, prepared.options
     domain, real = setup.domain, setup.stages.engine.real
     n = _cells_at_start(prepared)
     if n < domain.evenly_below:
         return domain.even_points(n)
+    if prepared.drawn == "lattice":
+        return sample_lattice(setup.free, n, options.seed)
     if options.start == "uniform":
         return sample_uniform(setup.free, n, options.seed, real)
     return sample_density(setup.sizing, setup.free, n, options.seed, real, prepared.count.tree)
@@ -413,9 +414,8 @@ def without_far(prepared: Prepared, max_levels: int | None = None) -> Prepared:
     if len(rows):
         new = np.full(len(points) - len(rows), -1)
         return replace(prepared, points=points, kept_rows=np.concatenate([before[rows], new]))
-    lattice = _lattice(setup, prepared.layout, prepared.count, options)
-    if lattice is not None:
-        return replace(prepared, points=None, kept_rows=None, lattice=lattice, levels=0)
+    if prepared.drawn == "lattice":
+        return replace(prepared, points=None, kept_rows=None, levels=0)
     levels = _count_levels(setup, None, prepared.count.target, len(prepared.layout.layers.points), options)
     levels = levels if max_levels is None else min(levels, max_levels)
     # Points are drawn for the coarsest level from the tree as it was.
@@ -427,8 +427,7 @@ def judge_points(prepared: Prepared, mesh: MeshState) -> tuple[Beginning, Prepar
     """Return how the run uses the points of the caller, whose mesh is `mesh`, and the run without far ones."""
     options, n = prepared.options, mesh.total
     if prepared.points is None or not options.multilevel:
-        drawn: Begins = "random" if prepared.lattice is None else "lattice"
-        return Beginning(drawn if prepared.points is None else "mesh"), prepared
+        return Beginning(prepared.drawn if prepared.points is None else "mesh"), prepared
     s = mesh.summaries.read()
     mean, quality = s["error"].magnitude / n, s["quality"].sum / n
     missing = mesh.missing_cells() if options.n_cells is None else float(options.n_cells - n)
@@ -442,8 +441,7 @@ def judge_points(prepared: Prepared, mesh: MeshState) -> tuple[Beginning, Prepar
     if options.levels == "auto" and (after := without_far(prepared)) is not prepared:
         if after.points is None:
             return Beginning(
-                "random" if after.lattice is None else "lattice",
-                f"the given points are all far from the sizes, and were replaced ({found})",
+                after.drawn, f"the given points are all far from the sizes, and were replaced ({found})"
             ), after
         assert after.kept_rows is not None
         share = f"{1 - np.count_nonzero(after.kept_rows >= 0) / len(prepared.points):.0%} of the given points are"

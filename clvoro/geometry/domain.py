@@ -442,7 +442,7 @@ class Domain(ClipBox):
         return Edges(x[order], x[(order + 1) % 4])
 
     def crease_edges(self, walls: Walls | None = None, *, concave: bool | None = None) -> Edges:
-        """Raise an `InputError`: solids have creases; see `Solid.crease_edges`."""
+        """Raise an `InputError`, as only solids have creases; see `Solid.crease_edges`."""
         raise InputError(f"{self} has no creases, expected a solid")
 
     def _checked_names(self) -> dict[str, list[int]] | None:

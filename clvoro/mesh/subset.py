@@ -158,7 +158,7 @@ _CORNERS = {"cell_vertex": "cell_vertices", "face_vertex": "face_vertices"}
 
 
 def _names(labels: list[str], before: tuple[str, ...], first: int) -> dict[str, list[int]] | None:
-    """Return the walls of each name, numbered from `first` on, names of `before` first; without the default name."""
+    """Return the walls of each name but the default one, numbered from `first` on; names in `before` come first."""
     names: dict[str, list[int]] = {name: [] for name in (*before, *labels)}
     for k, label in enumerate(labels):
         names[label].append(first + k)

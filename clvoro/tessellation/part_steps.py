@@ -101,7 +101,7 @@ def _squares(ways: np.ndarray) -> np.ndarray:
 
 
 class Chunks:
-    """The generators of a part, divided into chunks: runs of a Hilbert curve through the cells of a grid.
+    """The generators of a part in chunks: each holds those that follow one another on a Hilbert curve.
 
     - `points` (n, d) float: in the order of bins.
     - `least`: lower bound of `spacings`.

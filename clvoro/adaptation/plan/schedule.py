@@ -28,7 +28,8 @@ In 3D there is no lattice with dislocations. Each level glides, then polishes:
 Where sizes are the same in the whole domain, generators of a body-centered cubic lattice are the start, on the finest
 level:
 
-    lattice ─► couple ─► correct count ─► couple ─► correct count ─► glide ─► polish (─► project)
+    lattice ─► correct count ─► balance regions ─► glide ─► couple ─► correct count ─► balance regions ─► couple
+        ─► correct count ─► polish (─► project)
 
 Where the number of given points is far from that of the sizes, points of a density start replace them, and the run
 begins on the finest level.

@@ -186,7 +186,9 @@ def sample_uniform(domain: Domain, n: int, seed: int, real: DTypeLike = np.float
 
 
 def sample_lattice(domain: Domain, n: int, seed: int) -> np.ndarray:
-    """Return the points inside of a body-centered cubic lattice in a random position, about `n`, (m, 3) float64.
+    """Return those points of a body-centered cubic lattice that are inside, about `n` of them, (m, 3) float64.
+
+    The direction and the place of the lattice are random.
 
     Its cells are the best known ones for a constant size in space (Barnes and Sloane, SIAM J. Algebraic Discrete
     Methods 4, 1983): Q is 0.753.

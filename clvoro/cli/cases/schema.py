@@ -308,7 +308,7 @@ class ArrayTable(Kind):
     missing: Literal["error", "nearest"] | None = None
 
     def over(self, domain: Domain, values: np.ndarray) -> Any:
-        """Return an array over `domain`, unless the table has other corners."""
+        """Return the values as a raster over `domain`, or between the corners that the table has."""
         corners = self.lower or domain.lower, self.upper or domain.upper
         given = {key: value for key, value in self.given().items() if key in ("at", "missing", "outside")}
         return sizing.Raster(values, *corners, **given)

@@ -43,8 +43,8 @@ _SWEEPS = 100
 _RESIDUAL, _MOST = 1e-3, 60
 """Relative residual and most iterations of the linear systems for the ways of inner vertices."""
 _ROUNDS, _THINNER, _THINNED = 15, 0.6, 3
-"""How often layers change where cells are rejected; by which factor they become thinner there, and how often before
-they end."""
+"""Largest number of rounds in which layers change where cells are rejected. In each round they become thinner there by
+this factor; after so many rounds they end there."""
 _FLATTENED, _FARTHER, _LEAST_FREE = 3, 1.3, 0.3
 """How often small faces that bulge out move back, by which factor farther than their centers have to, and the least
 share of their vertices that counts as moving."""
@@ -693,7 +693,7 @@ class _LayeredWalls:
 
 
 def _nearest(points: np.ndarray, places: np.ndarray) -> np.ndarray:
-    """Return the row of the nearest of `points` (n, 3) to each of the `places` (k, 3), (k,) int."""
+    """Return for each of `places` (k, 3) the row of the nearest of `points` (n, 3), (k,) int."""
     return scipy.spatial.KDTree(points).query(places)[1]
 
 

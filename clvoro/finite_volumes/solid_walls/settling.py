@@ -23,7 +23,7 @@ _STEPS, _MOST = 8, 25_000
 """Largest number of steps, and largest product of the number of steps and that of cells: each step makes a mesh of all
 cells, and of many cells few are at walls."""
 _EXACT_STEPS, _LEAST = 24, 2
-"""Largest number of steps by the exact method, and that of many cells."""
+"""Largest number of steps by the exact method if there are few cells, and if there are many."""
 _ENOUGH, _EXACT_ENOUGH = (0.0015, 2.0), (0.0008, 2.0)
 """No further step follows if mean size error and mean angle of faces, in degrees, are at most these near walls."""
 _FEW = 0.03
@@ -163,8 +163,7 @@ def _step(
     The second ones are a damped least-squares solution of the linearized volumes. The cell of x grows by
     A (y - c) . dy / |y - x| where its neighbor y moves by dy; A and c are area and centroid of the face between them.
     """
-    f, n, volumes = made.faces, len(points), made.volumes
-    g = f.measures.geometry
+    f, g, n, volumes = made.faces, made.faces.measures.geometry, len(points), made.volumes
     free = ~stays & (volumes > 0)
     to_centroid = np.zeros((n, 3))
     moments = np.stack([made.sums(g.volumes * c) for c in g.centroids.T], axis=1)
