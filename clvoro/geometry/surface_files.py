@@ -26,6 +26,7 @@ _OPTIONS: dict[str, dict[str, Any]] = {
     "obj": {"skip_materials": True, "split_groups": True, "split_objects": True, "group_material": False}
 }
 _TURNS = 32  # triangles around a circle of a STEP file
+_FINEST = 1 / 2000  # least size of triangles, over the diagonal of the part: smaller fillets become chamfers
 _MOST_POINTS = 200_000  # on the edges of a STEP file: with more, faces would take Gmsh many minutes
 _UNITS = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "km": 1e3, "um": 1e-6, "in": 0.0254, "ft": 0.3048}
 _UNNAMED = "Open CASCADE STEP translator"  # so begin the names that Open CASCADE gives shapes without one
@@ -175,12 +176,15 @@ def _read_step(path: Path) -> list[FilePart]:
         # That of Open CASCADE: another one would stay in this process, for files that the caller writes.
         gmsh.option.setString("Geometry.OCCTargetUnit", "MM")
         gmsh.option.setNumber("Mesh.MeshSizeFromCurvature", _TURNS)
+        gmsh.option.setNumber("Mesh.MeshSizeExtendFromBoundary", 0)  # flat faces need no fine triangles beside fillets
         gmsh.model.add("part")
         gmsh.model.occ.importShapes(os.fspath(path))
         first, *others = gmsh.model.occ.getEntities(3) or [None]
         if others:  # parts that touch or overlap get common faces
             gmsh.model.occ.fragment([first], others)
         gmsh.model.occ.synchronize()
+        box = np.reshape(gmsh.model.getBoundingBox(-1, -1), (2, 3))
+        gmsh.option.setNumber("Mesh.MeshSizeMin", _FINEST * float(np.linalg.norm(box[1] - box[0])))
         gmsh.model.mesh.generate(1)
         _refuse_too_fine(path, len(gmsh.model.mesh.getNodes()[0]))
         gmsh.model.mesh.generate(2)

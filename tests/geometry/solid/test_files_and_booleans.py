@@ -65,6 +65,24 @@ def test_parts_of_step_files_are_united(tmp_path, monkeypatch):
         Solid.read(tmp_path / "part.step")
 
 
+def test_tiny_fillets_of_step_files_become_chamfers_of_few_triangles(tmp_path):
+    gmsh = pytest.importorskip("gmsh")
+    gmsh.initialize(interruptible=False)
+    try:
+        gmsh.option.setNumber("General.Terminal", 0)
+        plate = gmsh.model.occ.addBox(0, 0, 0, 100, 80, 10)
+        gmsh.model.occ.synchronize()
+        gmsh.model.occ.fillet([plate], [8], [0.05])
+        gmsh.model.occ.synchronize()
+        gmsh.write(str(tmp_path / "plate.step"))
+    finally:
+        gmsh.finalize()
+    solid = Solid.read(tmp_path / "plate.step")
+    assert solid.measure == pytest.approx(8e-5, rel=1e-5)
+    assert len(solid.surface.triangles) < 20_000  # 239,000 if they are as small as the fillet bends
+    assert solid.n_patches == 6  # as of a chamfer
+
+
 def test_the_outside_of_a_body_has_the_names_of_both():
     for option in ({"group_names": ["body"]}, {"name": "body"}):
         assert Solid.box((0, 0, 0), (1, 1, 1), **option).boundary_names == ("body",)
