@@ -26,7 +26,9 @@ class ResultParts:
 
     engine: Engine
     domain: Domain
-    rows: CellRows
+    rows: Callable[[], CellRows]
+    labels: np.ndarray
+    """(n,) int32. Permanent numbers of the cells of this part, ascending, as in the whole mesh."""
     fixed: np.ndarray
     """(k, d) float64. Positions of the first cells of the whole mesh."""
 
@@ -42,11 +44,6 @@ class ResultParts:
     def count(self) -> int:
         """Number of parts."""
         return self.engine.peers.count
-
-    @property
-    def labels(self) -> np.ndarray:
-        """Permanent numbers of the cells of this part, (n,) int32, ascending, as in the whole mesh."""
-        return np.sort(self.rows.labels)
 
     def together(self, work: Callable[[], None]) -> None:
         """Call `work` in all parts. An error in one of them is raised in all."""
@@ -64,7 +61,7 @@ class ResultParts:
         Raises `MemoryLimitError` on part 0, if neither its device nor a CPU has enough memory.
         """
         peers = self.engine.peers
-        rows, labels = self.rows.gather(peers), peers.collect(self.labels)
+        rows, labels = self.rows().gather(peers), peers.collect(self.labels)
         found = {name: peers.collect(getattr(result, name)) for name in _OF_CELLS}
         if rows is None:
             return None

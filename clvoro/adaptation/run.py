@@ -22,7 +22,7 @@ from ..opencl.prebuild import renew
 from ..opencl.primitives import Summary
 from ..solvers.linear_system import Solution
 from ..tessellation.periodic.images import FewCellsError
-from ..tessellation.readback.parts import CellRows
+from ..tessellation.readback.parts import LaterDiagram
 from .checkpoint import Checkpointer, Saved, progress_of, run_fingerprint, take_progress
 from .diagnostics import MISSED, warn_of_errors, warn_of_moved_points, warn_of_obtuse_triangles, warn_of_other_sizes
 from .fixed_points import origins, put_back
@@ -520,14 +520,14 @@ class Run:
             origin = np.where(origin < 0, -1, self._origins[origin])
         elif self.arguments.points is not None:
             origin = np.full_like(origin, -1)
-        parts = None
-        if self._is_part:
-            parts = ResultParts(mesh.engine, self._domain, CellRows.of(mesh.t, mesh.labels), fixed)
         held = self.arguments.fixed
         extrudes = bool(self._options.layers) and self._domain.extrudes_layers
         # Layers of prisms become thinner where generators below them have settled.
         targets = None if extrudes else mesh.cell_targets(self._options.method == "exact")
-        diagram, settings = mesh.fetch_diagram(len(held), targets), dict(self._settings)
+        diagram, settings, parts = mesh.fetch_diagram(len(held), targets), dict(self._settings), None
+        if self._is_part:
+            assert isinstance(diagram, LaterDiagram)
+            parts = ResultParts(mesh.engine, self._domain, diagram.rows, labels, fixed)
         if extrudes:
             from ..finite_volumes.solid_walls.layers import add_layers
 

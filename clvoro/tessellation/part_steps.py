@@ -32,7 +32,7 @@ from ..opencl.primitives import NamedArrays
 from .bins import BinnedPoints
 from .clipped.cut import Cut
 from .cut_cells import CutCells
-from .decomposition import hilbert_keys
+from .decomposition import coarse_keys
 from .device_diagram import Follow, Tessellation
 from .part import Ghosts, Part, follow_images
 from .periodic.ghost_images import ExtendedBox
@@ -46,8 +46,9 @@ FIRST_REACH = {2: 3.3, 3: 2.5}
 those of neighboring ghosts must be final, too."""
 LAST_LABEL = 2**31 - 1
 """Label of the first ghost generator outside of a polygon; the others have those before it."""
-RUN, AHEAD = 32, 4
-"""Number of successive generators from which their spacing is estimated, and of the next ones that are compared."""
+RUN, AHEAD, CACHED = 32, 4, 1 << 13
+"""Number of successive generators from which their spacing is estimated, of the next ones that are compared, and of
+those that are compared at a time."""
 JUMP = 12
 """Number of spacings between successive generators beyond which a new chunk begins."""
 GROWTH, SKIN, SHARE = 1.4, 0.25, 0.4
@@ -76,22 +77,18 @@ FAILED = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0])
 attempt to trace the boundary of a polygon, and the number of generators."""
 
 
-@cache
-def _curve(dim: int) -> np.ndarray:
-    """Return the places along a Hilbert curve of the cells of a grid, row by row; the grid has at most 2^16 cells."""
-    side = 2 ** (16 // dim)
-    cells = np.indices((side,) * dim).reshape(dim, -1).T
-    return hilbert_keys(cells, np.zeros(dim), np.full(dim, side), 16 // dim).astype(np.uint16)
-
-
 def _nearest_ahead(axes: np.ndarray) -> np.ndarray:
     """Return the square of the distance of each point, a column of `axes` (d, n), from the nearest of the next `AHEAD`.
 
     The result is (n,) float.
     """
-    nearest = np.full(axes.shape[1], np.inf)
-    for ahead in range(1, min(AHEAD, axes.shape[1] - 1) + 1):
-        np.minimum(nearest[:-ahead], _squares(axes[:, ahead:] - axes[:, :-ahead]), out=nearest[:-ahead])
+    n = axes.shape[1]
+    nearest = np.full(n, np.inf)
+    # Blocks stay in a core's cache.
+    for x, found in ((axes[:, k : k + CACHED + AHEAD], nearest[k : k + CACHED]) for k in range(0, n, CACHED)):
+        for ahead in range(1, min(AHEAD, x.shape[1] - 1) + 1):
+            ways = _squares(x[:, ahead : ahead + len(found)] - x[:, : min(len(found), x.shape[1] - ahead)])
+            np.minimum(found[: len(ways)], ways, out=found[: len(ways)])
     return nearest
 
 
@@ -117,12 +114,9 @@ class Chunks:
 
     def __init__(self, points: np.ndarray, least: float) -> None:
         # Sums and extrema over the axes of many points take a tenth of the time if each axis is contiguous.
-        n, dim = points.shape
-        axes, side, cells = np.ascontiguousarray(points.T), 2 ** (16 // dim), np.zeros(n, np.int32)
-        for x in axes:
-            along = ((x - x.min()) * (side / max(np.ptp(x), least))).astype(np.int32)
-            cells = cells * side + np.minimum(along, side - 1, out=along)
-        self.order = np.argsort(_curve(dim)[cells], kind="stable")
+        n, axes = len(points), np.ascontiguousarray(points.T)
+        lower = axes.min(axis=1)
+        self.order = np.argsort(coarse_keys(axes, lower, np.maximum(axes.max(axis=1), lower + least)), kind="stable")
         x = np.ascontiguousarray(np.take(points, self.order, axis=0).T)
         nearest = np.minimum(_nearest_ahead(x), _nearest_ahead(axes)[self.order])
         runs = np.arange(max(n // RUN, 1)) * RUN
@@ -527,7 +521,8 @@ class PartSteps(DomainSteps):
             if convex is not None and self._cut is not None:
                 t = self._cut.finish_updated(convex, part.points, part.count, attempt)
             if part.ghosts is None:
-                return None if t is None else replace(t, part=part)
+                # Cells that fitted are known by the diagram that an update has returned.
+                return None if t is None else replace(t, part=part, whole=t)
             needed = engine.scratch((n, 2), np.float32)
             if t is not None:
                 given = self._at, self._limits_there, 2 * (1 + NOISE[engine.real.name]), self._reads_rows, needed
@@ -711,8 +706,10 @@ class PartSteps(DomainSteps):
                 facing[side] = balls.facing(facts)
         none = np.empty(0, int)
         asked = [balls.meeting(facing[side]) if side in facing else none for side in range(len(self._sent))]
-        sizes = np.column_stack([needed, (1 + SKIN) * radii])
-        requests = [np.hstack([x[rows] - self._shifts[side % ways], sizes[rows]]) for side, rows in enumerate(asked)]
+        requests = [
+            np.column_stack([x[rows] - self._shifts[side % ways], needed[rows], (1 + SKIN) * radii[rows]])
+            for side, rows in enumerate(asked)
+        ]
         given, sent = [none] * len(asked), []
         for number, requested in enumerate(peers.exchange(self._joined(requests))):
             answers = []
@@ -754,9 +751,8 @@ class PartSteps(DomainSteps):
         firsts = np.arange(0, len(balls), GROUP)
         lower = np.minimum.reduceat(balls[:, :dim] - balls[:, dim:], firsts, axis=0)
         groups = np.hstack([lower, np.maximum.reduceat(balls[:, :dim] + balls[:, dim:], firsts, axis=0)])
-        near = (gaps(own.boxes[:, None], groups) <= 0).any(axis=1)[own.chunks.groups]
-        near[known] = False
-        rows = np.flatnonzero(near)
+        rows = own.chunks.rows(np.flatnonzero((gaps(own.boxes[:, None], groups) <= 0).any(axis=1)))
+        rows = np.sort(rows[np.isin(rows, known, invert=True)])
         places = own.centers[rows]
         found = inside(places, balls)
         return rows[found].astype(np.int32), places[found]

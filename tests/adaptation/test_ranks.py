@@ -39,6 +39,7 @@ from clvoro.opencl.engine import Engine
 from clvoro.opencl.peers import Peers
 from clvoro.opencl.threads import Team
 from clvoro.tessellation.part_steps import FIRST_REACH, PartSteps
+from clvoro.tessellation.readback.parts import CellRows
 from clvoro.tessellation.stages import UPDATES
 
 ARRAYS = (
@@ -227,6 +228,44 @@ def test_parts_ask_once_where_few_cells_need_larger_balls(ctx, monkeypatch):
     one, two = (run_in(parts, ctx, *given, points=x, method="lloyd", max_steps=0)[1] for parts in (1, 2))
     assert asked == {1}
     assert np.array_equal(one.neighbors, two.neighbors)
+
+
+def test_a_part_that_is_alone_updates_what_it_has_updated_last(ctx, monkeypatch):
+    """So cells that fitted at the last step are checked quickly, as without parts."""
+    known, update = [], PartSteps.update
+
+    def noted(steps, *given):
+        last = steps.stages.update._last
+        before = given[2].whole or given[2]
+        known.append(last is not None and last() is (before if before.trimmed is None else before.trimmed.convex))
+        return update(steps, *given)
+
+    monkeypatch.setattr(PartSteps, "update", noted)
+    x = np.random.default_rng(70105).random((300, 2))
+    for domain in (clvoro.Box((0, 0), (1, 1)), LAKE):
+        known.clear()
+        run_in(1, ctx, domain, 0.05, points=x[domain.contains(x)], method="lloyd", max_steps=8)
+        assert any(known), domain
+
+
+def test_a_mesh_is_read_when_it_is_used(ctx, monkeypatch):
+    """Neither at the end of a run, nor twice, and no later than the diagram, whose memory is then free."""
+    read, of = [], CellRows.of
+    monkeypatch.setattr(CellRows, "of", lambda *given: read.append(given) or of(*given))
+
+    def work(peers):
+        mesh = clvoro.Adapter(ctx, comm=peers).run(clvoro.Box((0, 0), (1, 1)), 0.1, method="lloyd", max_steps=1)
+        peers.any(False)
+        before = len(read)
+        peers.any(False)
+        volumes, told = mesh.volumes, len(read)
+        return before, told > 0, volumes.sum(), mesh.gather()
+
+    found = Team(2).run(work)
+    assert [before for before, *_ in found] == [0, 0]
+    assert all(told for _, told, *_ in found)
+    assert len(read) == 2
+    assert found[0][-1].volumes.sum() == pytest.approx(sum(volume for *_, volume, _ in found))
 
 
 def test_a_run_in_parts_of_a_periodic_box(ctx, tmp_path):

@@ -15,7 +15,7 @@ from clvoro.opencl.threads import Team
 from clvoro.solvers import multigrid
 from clvoro.solvers.linear_system import Limits
 from clvoro.solvers.volume_projection import Penalty, Targets
-from clvoro.tessellation import part_steps
+from clvoro.tessellation import decomposition, part_steps
 from clvoro.tessellation.part import Ghosts, Part
 from clvoro.tessellation.part_steps import NEAR, BallGroups, Chunks
 from clvoro.tessellation.tessellator import Tessellator
@@ -418,3 +418,37 @@ def test_balls_and_boxes_of_two_parts(monkeypatch):
     assert (facing.away[alone] > NEAR * np.maximum(balls.largest[alone], others.largest.max()) / 2).all()
     near = np.flatnonzero((ways <= 1.25 * radii[facing.balls, None]).any(axis=1))
     assert np.array_equal(np.sort(balls.meeting(facing)), np.sort(facing.balls[near]))
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_blocks_of_short_and_long_keys(dim):
+    """Short keys are the first bits of long ones, and give the same blocks, unless most are in one place."""
+    x = np.random.default_rng(5110).random((20_000, dim))
+    corners, bits = (np.zeros(dim), np.ones(dim)), 16 // dim
+    for points, enough in ((x, True), (x**12, False)):
+        keys = decomposition.hilbert_keys(points, *corners), decomposition.coarse_keys(points.T, *corners)
+        assert np.array_equal(keys[0] >> np.uint64(dim * (decomposition.BITS - bits)), keys[1])
+        (_, long, _), (_, short, reached) = (
+            decomposition.divide(keys[k], dim, ALONE, b) for k, b in ((0, 20), (1, bits))
+        )
+        assert reached == enough == np.array_equal(long, short)
+
+
+@pytest.mark.parametrize("power", [1, 12])
+def test_generators_are_distributed(ctx, power):
+    """Each part gets a share, with its labels; also where nearly all are in one place."""
+    x = np.random.default_rng(5111).random((3000, 2)) ** power
+    box = Box((0, 0), (1, 1))
+
+    def work(peers):
+        engine = patch.make_engine(ctx, np.dtype(float), 2, box=box)
+        engine.peers, own = peers, slice(0, len(x) * (peers.number == 0))
+        rows = {"points": engine.upload(x[own]), "labels": engine.upload(np.arange(len(x))[own], np.int32)}
+        found = decomposition.distribute(engine, box, rows)
+        return found["points"].get(), found["labels"].get()
+
+    parts = Team(3).run(work)
+    labels = np.concatenate([found for _, found in parts])
+    assert np.array_equal(np.sort(labels), np.arange(len(x)))
+    assert np.array_equal(np.concatenate([points for points, _ in parts]), x[labels])
+    assert max(len(points) for points, _ in parts) < decomposition.UNBALANCED * len(x) / 3

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Any
 
 import numpy as np
@@ -26,7 +26,7 @@ from ..tessellator import Tessellator
 from .diagram import fetch_diagram, order_of
 
 
-def fetch_part(engine: Engine, domain: Domain, t: Tessellation, labels: cla.Array) -> Diagram:
+def fetch_part(engine: Engine, domain: Domain, t: Tessellation, labels: cla.Array) -> LaterDiagram:
     """Return the cells of a part in the order of `labels` (n,). Faces towards cells of part k are walls ``"rankK"``."""
     assert t.part is not None
     (n, part, whole), own = (t.n, t.part, t.whole), labels.get()[: t.n]
@@ -35,16 +35,18 @@ def fetch_part(engine: Engine, domain: Domain, t: Tessellation, labels: cla.Arra
     ghosts = np.arange(n, part.count)
     beside = np.isin(ghosts, t.neighbors.get()[: int(t.starts[n].get())]) if whole is None else ghosts >= n
 
+    rows = cache(lambda: CellRows.of(t, labels))
+
     def read_all() -> Diagram:
-        rows = CellRows.of(t, labels).gather(ALONE)
-        assert rows is not None
-        return rows.diagram(engine, domain)
+        gathered = rows().gather(ALONE)
+        assert gathered is not None
+        return gathered.diagram(engine, domain)
 
     def read_with(beside: np.ndarray) -> Diagram:
         """Cells share vertices with those of the ghosts `beside` them, (g,) bool."""
-        rows = np.concatenate([np.arange(n), ghosts[beside], ghosts[~beside]])
+        order = np.concatenate([np.arange(n), ghosts[beside], ghosts[~beside]])
         made, count = whole, n + np.count_nonzero(beside)
-        there = part if whole is not None else part.in_order(engine, rows)
+        there = part if whole is not None else part.in_order(engine, order)
         if made is None:
             stages = TessellationStages(engine)
             binned = stages.bins.build(there.box, there.points, there.count)
@@ -66,33 +68,39 @@ def fetch_part(engine: Engine, domain: Domain, t: Tessellation, labels: cla.Arra
             return read_with(ghosts >= n)
 
     if (part.peers or ALONE).count > 1:
-        return _LaterDiagram(points, read)
-    found = _LaterDiagram(points, read_all)
+        return LaterDiagram(points, rows, read)
+    found = LaterDiagram(points, rows, read_all)
     found.domain = domain
     return found
 
 
-class _LaterDiagram(Diagram):
-    """A diagram that is read as a whole when more than its points is used."""
+class LaterDiagram(Diagram):
+    """A diagram of a part that is read as a whole when more than its points is used.
 
-    def __init__(self, points: np.ndarray, read: Callable[[], Diagram]) -> None:
-        self.points, self._read = points, read
+    `rows` returns its cells as `CellRows`, which are read no later than the diagram.
+    """
+
+    def __init__(self, points: np.ndarray, rows: Callable[[], CellRows], read: Callable[[], Diagram]) -> None:
+        self.points, self.rows, self._read = points, rows, read
         self._derived, self.home = {}, None
         self.layer = self._derive("layer")  # parts have no layers
 
     @cached_property
     def _made(self) -> Diagram:
         check_process()
+        self.rows()  # so that the device's arrays are free then
         made = self._read()
         made.put_points(self.points)
         del self._read
         return made
 
     def put_points(self, points: np.ndarray) -> None:
+        """Replace the points, without reading the others."""
         self.points = read_only(points)
 
     @cached_property
     def domain(self) -> Domain:
+        """The domain of these cells."""
         return self._made.domain
 
     @cached_property
