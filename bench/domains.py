@@ -13,7 +13,6 @@ in GB, on the host. "quality" is the mean of the cells.
 
 from __future__ import annotations
 
-import math
 import resource
 import statistics
 import time
@@ -31,7 +30,9 @@ def figure(*parts: str, digits: int = 2) -> Callable[[dict[str, Any]], str]:
     """Return the text of a column: the sum of some parts in the box, in the domain, and the ratio."""
 
     def text(row: dict[str, Any]) -> str:
-        box, domain = (sum(row[name].get(part, math.nan) for part in parts) for name in ("box", "domain"))
+        if not row["box"].keys() >= set(parts):
+            return "-"
+        box, domain = (sum(row[name][part] for part in parts) for name in ("box", "domain"))
         return f"{box:.{digits}f}, {domain:.{digits}f}, {domain / box:.2f}"
 
     return text

@@ -21,7 +21,7 @@ class InputTypeError(ClvoroError, TypeError):
 
 
 class OutputError(InputError):
-    """A file cannot be written: the folder does not exist, permission is missing, or the disk is full."""
+    """A file cannot be written: no folder, no permission, the disk is full, or OpenFOAM rejects the mesh."""
 
 
 class DeviceError(ClvoroError, RuntimeError):

@@ -492,7 +492,8 @@ class Run:
             mean, last, reason = float(result.history["mean_error"][-1]), result.history[-WINDOW:], ""
             if mean > max(MISSED, self._options.error_target or 0.0):
                 reason = f"{MISSES}: mean |e| {mean:.2g}"
-            elif len(wild := last["step"][last["residual"] > 1]):
+            # One cycle of multigrid, as the first steps after a refinement take, may raise the residual.
+            elif len(wild := last["step"][(last["residual"] > 1) & (last["iterations"] > 1)]):
                 reason = f"plan ended, but step {wild[-1]} did not converge: cells are less regular than usual"
             if reason:
                 warn_of_errors(result, self.state.sizing)

@@ -27,7 +27,7 @@ from numpy.typing import ArrayLike
 
 from ..arguments import check_flag
 from ..connectivity import slices
-from ..errors import InputError, InputTypeError
+from ..errors import InputError, InputTypeError, OutputError
 from ..finite_volumes.gate import rejection
 from ..finite_volumes.prisms import polyhedra
 from ..finite_volumes.solver_mesh import WallShape, make_solver_mesh
@@ -107,8 +107,8 @@ def poly_mesh(
 
     Raises `InputError` or `InputTypeError` if `patches` names walls that do not exist, or a wall twice; if `types`
     names a patch or type that does not exist; if `thickness` is not positive, or given in 3D; if a name is that of a
-    cyclic or empty patch; for a cell around an island, as a face of OpenFOAM has no hole; or if OpenFOAM rejects the
-    mesh: says where.
+    cyclic or empty patch; or for a cell around an island, as a face of OpenFOAM has no hole. Raises `OutputError` if
+    OpenFOAM rejects the mesh: says where.
     """
     domain = diagram.domain
     parts = domain.boundaries if patches is None else domain.boundaries.renamed("patches", patches)
@@ -116,7 +116,7 @@ def poly_mesh(
     mesh = make_solver_mesh(diagram, walls, walls == "straight", parts.index)
     cells = polyhedra(mesh, thickness)
     if check and (why := rejection(mesh, walls)):
-        raise InputError(
+        raise OutputError(
             f"{why}. To write it all the same, call mesh.to_openfoam(path, check=False), or clvoro with --unchecked"
         )
     groups = parts.index[-1 - mesh.neighbor[mesh.n_inner : mesh.n_outer]]
@@ -298,6 +298,7 @@ def _write_piece(
     make_folder(folder)
     note = f"nPoints:{len(piece.points)} nCells:{len(piece.cells)} nFaces:{len(piece.owner)} nInternalFaces:{inner}"
     notes = {"owner": note, "neighbour": note, "points": changed}
+    lists: dict[str, Iterable[bytes]]
     if binary:
         lists = {
             "points": _bytes(piece.points, np.float64),

@@ -411,7 +411,7 @@ def _check_lost(surface: WallSurface, near: NearWalls, home: np.ndarray) -> None
     if len(lost) > FEW * len(near.points):
         place = format_point(near.generators[lost[0]])
         raise InputError(
-            f"{surface.solid} is too thin for cells of this size: {len(lost)} generators have no cell, the first at "
+            f"{surface.solid} is too thin for cells of this size: generators without one: {len(lost)}, the first at "
             f"{place}, where h is {near.sizes[lost[0]]:.3g}; use smaller cells there"
         )
 

@@ -221,7 +221,7 @@ def repaired(skin: Skin) -> Skin:
     triangles, groups = triangles[rows].copy(), groups[rows]
     caps = _caps(Surface(vertices, triangles))
     if caps:
-        done.append(f"closed {len(caps)} flat holes")
+        done.append(f"closed {len(caps)} flat hole{'s' * (len(caps) > 1)}")
         groups = np.concatenate([groups, np.repeat(len(names) + np.arange(len(caps)), list(map(len, caps)))])
         names += tuple(f"hole-{k + 1}" for k in range(len(caps)))
         triangles = np.concatenate([triangles, *caps])

@@ -148,7 +148,7 @@ FLIPPED = np.vstack([T[:3, ::-1], T[3:]])
 @pytest.mark.parametrize(
     ("vertices", "triangles", "says"),
     [
-        (V, T[1:], "3 edges .* Here repair=True closes it .closed 1 flat holes"),
+        (V, T[1:], r"3 edges .* Here repair=True closes it .closed 1 flat hole\)"),
         (V, T[:2], "4 edges .* with_surfaces. Or pass wrap="),
         (*with_gap(1e-4), r"join=0\.000\d+ closes it"),
         (V, np.vstack([T, T[:1], T[3:4]]), "2 duplicate triangles"),
