@@ -28,7 +28,7 @@ from .plan.actions import Action, Prescribe
 from .plan.efforts import NEAR_COUNT, NEAR_ERROR, choose_error_target, is_near, steep_share
 from .plan.schedule import Begins, adaptive_schedule, auto_levels, repeated_schedule
 from .sampling.quadrature import DensityTree
-from .sampling.start import charted, density_tree, replace_far, sample_density, sample_lattice, sample_uniform
+from .sampling.start import charted, density_tree, replace_far, sample_density, sample_even, sample_uniform
 from .stages import Stages
 from .state import MeshState, Setup
 from .tuning import CELLS_ACROSS, GRADIENT_STEP, LATTICE, LEAST_STEEP, MOVES, NEAR_SIZE, OPENINGS, SAMPLED_SIZES, STEPS
@@ -67,10 +67,15 @@ class Prepared:
     kept_rows: np.ndarray | None
     """(n,) int or None. For each of `points` its index in those of the caller, or -1; None if all are those of the
     caller."""
-    drawn: Begins
-    """"random" or "lattice": what generators are at the start where the caller gives none."""
+    even: tuple[float, ...]
+    """Sizes that many cells have. If there are any, and the caller gives no points, lattices are there at the start."""
     memory: float
     """Estimated device memory of the run, or of reading its diagram, in bytes."""
+
+    @property
+    def drawn(self) -> Begins:
+        """What generators are at the start where the caller gives none."""
+        return "lattice" if self.even else "random"
 
     @property
     def origins(self) -> np.ndarray | None:
@@ -123,22 +128,26 @@ def prepare(stages: Stages, arguments: RunArguments, max_levels: int | None = No
     check_memory(stages.engine, most, domain)  # before creases have generators
     setup = _set_up(stages, layout, sizing, count, fixed, options)
     lattice = lattice_points(domain, count.target) if options.method in MOVING else None
-    drawn = _drawn(domain, count, options)
+    even = _even_sizes(domain, count, options)
     levels = 0
-    if options.multilevel and (points is not None or drawn == "random"):
+    if options.multilevel and (points is not None or not even):
         levels = _count_levels(setup, points, count.target, len(layout.layers.points), options)
     if options.levels == "auto" and max_levels is not None:
         levels = min(levels, max_levels)
     check_prisms(layout.layers.prisms(lambda x: count.factor * sizing(x)))
     memory = _estimate_memory(setup, options, count, most, levels)
-    return Prepared(options, setup, points, layout, count, lattice, levels, kept_rows, drawn, memory)
+    return Prepared(options, setup, points, layout, count, lattice, levels, kept_rows, even, memory)
 
 
-def _drawn(domain: Domain, count: CellCount, options: Options) -> Begins:
-    """Return what a run without given points begins with: a lattice where many cells have the same size in space."""
-    free = options.multilevel and options.start == "density" and options.levels == "auto"
-    many = free and count.tree is not None and count.target >= LATTICE[domain.cell_dim]
-    return "lattice" if many and count.tree.is_uniform else "random"  # type: ignore[union-attr]
+def _even_sizes(domain: Domain, count: CellCount, options: Options) -> tuple[float, ...]:
+    """Return the sizes, in space, of the lattices that a run without given points begins with.
+
+    Together at least a half of the cells have these sizes.
+    """
+    if not options.multilevel or options.start != "density" or options.levels != "auto" or count.tree is None:
+        return ()
+    even = count.tree.even_sizes(LATTICE[domain.cell_dim] * count.tree.integral / count.target)
+    return tuple(even) if 2 * sum(even.values()) >= count.tree.integral else ()
 
 
 def _set_up(
@@ -384,8 +393,9 @@ def _sample(prepared: Prepared) -> np.ndarray:
     n = _cells_at_start(prepared)
     if n < domain.evenly_below:
         return domain.even_points(n)
-    if prepared.drawn == "lattice":
-        return sample_lattice(setup.free, n, options.seed)
+    if prepared.even:
+        assert prepared.count.tree is not None
+        return sample_even(prepared.count.tree, setup.free, n, options.seed, real, prepared.even)
     if options.start == "uniform":
         return sample_uniform(setup.free, n, options.seed, real)
     return sample_density(setup.sizing, setup.free, n, options.seed, real, prepared.count.tree)
@@ -414,10 +424,10 @@ def without_far(prepared: Prepared, max_levels: int | None = None) -> Prepared:
     if len(rows):
         new = np.full(len(points) - len(rows), -1)
         return replace(prepared, points=points, kept_rows=np.concatenate([before[rows], new]))
-    if prepared.drawn == "lattice":
-        return replace(prepared, points=None, kept_rows=None, levels=0)
-    levels = _count_levels(setup, None, prepared.count.target, len(prepared.layout.layers.points), options)
-    levels = levels if max_levels is None else min(levels, max_levels)
+    levels = 0
+    if not prepared.even:
+        levels = _count_levels(setup, None, prepared.count.target, len(prepared.layout.layers.points), options)
+        levels = levels if max_levels is None else min(levels, max_levels)
     # Points are drawn for the coarsest level from the tree as it was.
     tree = density_tree(setup.sizing, setup.free)
     return replace(prepared, points=None, kept_rows=None, levels=levels, count=prepared.count._replace(tree=tree))
@@ -477,6 +487,7 @@ def plan(prepared: Prepared, begins: Begins) -> Plan:
         openings=OPENINGS if domain.for_c_grids else 0,
         narrow_parts=domain.cuts_cells,
         most=options.max_steps,
+        cells=prepared.count.target,
     )
     if options.method == "transport":
         schedule += [Prescribe(), *[Prescribe(move=True)] * MOVES]

@@ -36,6 +36,9 @@ COARSEST = {2: 1400, 3: 1500}
 """Approximate number of cells of the coarsest level by dimension."""
 LATTICE = {2: float("inf"), 3: 1000}
 """Least number of cells of equal sizes that start from a lattice, by dimension. In 2D lattices form in any run."""
+LATTICE_GLIDE, LATTICE_CELLS, MOST_GLIDE = 0.5, 4000.0, 5.0
+"""Steps of gliding after a start from a lattice, over those without coarser levels, for many cells; number of cells
+that take twice as many, as most of them are near walls; largest such factor."""
 PART_CELLS = {2: 100_000, 3: 50_000}
 """Least number of cells of a part on coarser levels, by dimension: on levels of fewer cells not all parts work."""
 CELLS_ACROSS = 5.0

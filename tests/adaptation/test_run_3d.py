@@ -72,13 +72,18 @@ def test_figures_of_adaptive_runs(adapter, adapter32, dtype, options, mean, larg
     assert (result.converged, result.stop_reason) == (True, "plan completed")
 
 
-def test_runs_at_a_constant_size_start_from_a_lattice(adapter):
+@pytest.mark.parametrize("graded", [False, True])
+def test_runs_start_from_a_lattice_where_sizes_are_the_same(adapter, graded):
     """Its cells have Q = 0.753, those of random starts about 0.71."""
     box = clvoro.Box((0, 0, 0), (1, 1, 1), periodic=True)
+    near = sizing.Circle((0.5, 0.5, 0.5), 0.05)
+    size = sizing.Distance(near, 0.04, slope=0.2, h_max=0.07) if graded else 0.09
     lattice, random = (
-        adapter.run(box, 0.09, "fast", options=options) for options in (None, clvoro.MultilevelOptions(levels=0))
+        adapter.run(box, size, "fast", options=options) for options in (None, clvoro.MultilevelOptions(levels=0))
     )
-    assert lattice.quality.mean() > 0.735 > 0.73 > random.quality.mean()
+    even = lattice.target_size > 0.0699
+    assert 0.5 < even.mean()
+    assert lattice.quality[even].mean() > 0.735 > 0.73 > random.quality.mean()
     assert np.abs(lattice.size_error).mean() < 0.003
     assert len(lattice.history) < len(random.history)
 

@@ -37,7 +37,7 @@ CASES = {
     "crossing": (BOX, [fault(0.3), fault(-0.3)], "float64", {f"region-{k}": v for k, v in enumerate(FAULTED)}, 1e-9),
     "oblique": (BOX, rectangle(-0.2, 1.2, rise=0.3), "float32", {"region-0": 0.5, "region-1": 0.5}, 1e-5),
     "at a wall": (BOX, {"slab": Solid.box((0, 0, 0), (0.3, 1, 1))}, "float64", {"slab": 0.3}, 1e-9),
-    "ball": (BOX, {"ball": Solid.ball((0.5, 0.5, 0.5), 0.3)}, "float64", {"ball": 4 / 3 * np.pi * 0.027}, 0.003),
+    "ball": (BOX, {"ball": Solid.ball((0.5, 0.5, 0.5), 0.3)}, "float64", {"ball": 4 / 3 * np.pi * 0.027}, 0.006),
     "solid": (
         Solid.box((0, 0, 0), (1, 1, 1)),
         {"rod": Solid.cylinder((0.5, 0.5, -0.2), (0.5, 0.5, 1.2), 0.25)},

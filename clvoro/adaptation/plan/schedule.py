@@ -25,8 +25,8 @@ In 3D there is no lattice with dislocations. Each level glides, then polishes:
 *correct count ahead*  to the number from which refinement gives that of the next level, where it seldom has to change
 *balance regions*      each region that fixed generators cut off gets its number of cells
 
-Where sizes are the same in the whole domain, generators of a body-centered cubic lattice are the start, on the finest
-level:
+Where at least half of the cells have the same size, generators of a body-centered cubic lattice are there at the start,
+and random ones elsewhere, on the finest level:
 
     lattice ─► correct count ─► balance regions ─► glide ─► couple ─► correct count ─► balance regions ─► couple
         ─► correct count ─► polish (─► project)
@@ -92,6 +92,7 @@ def adaptive_schedule(
     openings: int = 0,
     narrow_parts: bool = False,
     most: int | None = None,
+    cells: float = math.inf,
 ) -> list[Action]:
     """Return the schedule of the methods "adaptive" and "exact", with `levels` coarser levels.
 
@@ -108,6 +109,7 @@ def adaptive_schedule(
       penalty of exact projections falls step by step (see `GRADUAL_PENALTIES`).
     - `most`: largest number of steps from a mesh without coarser levels. Sweeps, and in 3D steps of the first
       polishing, are left out to meet it. The last steps, which polish, are kept, even if they are more.
+    - `cells`: number of cells. Few cells, most of which are near walls, glide longer from a lattice.
     """
     if error_target is None:
         error_target = choose_error_target(dim, effort, levels, begins == "near")
@@ -115,7 +117,9 @@ def adaptive_schedule(
     def planned(effort: Effort) -> list[Action]:
         if begins == "near":
             return list(_correction(dim, effort, exact, error_target))
-        return list({2: _adaptive_2d, 3: _adaptive_3d}[dim](effort, levels, exact, error_target, begins))
+        if dim == 3:
+            return list(_adaptive_3d(effort, levels, exact, error_target, begins, cells))
+        return list(_adaptive_2d(effort, levels, exact, error_target, begins))
 
     settings = EFFORTS_OF[dim][effort]
     schedule = planned(settings)
@@ -285,7 +289,9 @@ def _finish_2d(effort: Effort, exact: bool, error_target: float, penalty: float)
         yield from [Step(separate)] * effort.separate
 
 
-def _adaptive_3d(effort: Effort, levels: int, exact: bool, error_target: float, begins: Begins) -> Iterator[Action]:
+def _adaptive_3d(
+    effort: Effort, levels: int, exact: bool, error_target: float, begins: Begins, cells: float
+) -> Iterator[Action]:
     warm = begins != "random"
     couple = [Step(COUPLE)]
     coarse_glide = _glide_3d(effort, tuning.COARSE_PENALTY, tuning.COARSE_TOLERANCE)
@@ -305,7 +311,8 @@ def _adaptive_3d(effort: Effort, levels: int, exact: bool, error_target: float, 
                 yield CorrectCount(tuning.COUNT_LEAST, tuning.POLISH_GROWTH_3D)
             yield from couple * effort.recouple
         if begins == "lattice":
-            yield from [Step(coarse_glide)] * max(effort.alone // 2 - effort.glide, 0)
+            share = tuning.LATTICE_GLIDE * min(1 + (tuning.LATTICE_CELLS / cells) ** 2, tuning.MOST_GLIDE)
+            yield from [Step(coarse_glide)] * max(int(share * effort.alone) - effort.glide, 0)
             yield ResetMomentum()
         elif level or (not levels and begins != "mesh"):
             yield from [Step(coarse_glide)] * (effort.coarse_glide if levels else effort.alone)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import reduce
 
 import numpy as np
@@ -18,6 +18,7 @@ _BASE = {2: 1024, 3: 4096}  # initial boxes inside the domain, at least
 _MAX_BASE = {2: 16384, 3: 65536}  # initial boxes in total, at most
 _MAX_BOXES = {2: 1 << 17, 3: 1 << 17}  # at which refinement ends
 _BATCH = 1 << 19  # points evaluated at once
+_EVEN = 1.01  # ratio of sizes that count as the same
 
 # Ratios of sizes for refinement beyond the error estimate: see `DensityTree`.
 _STEEP = 2.0
@@ -39,6 +40,12 @@ def _slopes(points: np.ndarray, values: np.ndarray) -> np.ndarray:
         length2 = (step**2).sum(axis=2)
         squares += np.divide(rise**2, length2, out=np.zeros_like(rise), where=length2 > 0).mean(axis=1)
     return np.sqrt(squares)
+
+
+def _which(sizes: Sequence[float], low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """Return the index of the first of `sizes` that all from `low` to `high` (n,) are, or their number, (n,) int."""
+    same = [(low * _EVEN >= size) & (high <= size * _EVEN) for size in sizes]
+    return np.argmax([*same, np.ones(len(low), bool)], axis=0)
 
 
 class DensityTree:
@@ -110,10 +117,34 @@ class DensityTree:
         """Sum of the error estimates, in cells."""
         return float(self._errors.sum())
 
-    @property
-    def is_uniform(self) -> bool:
-        """Whether h is the same in the whole domain, to one percent."""
-        return bool(self._high.max() <= 1.01 * self._low.min())
+    def even_sizes(self, least: float) -> dict[float, float]:
+        """Return the sizes that at least `least` cells have, to one percent, and the numbers of these cells."""
+        even = np.flatnonzero(self.coverage.occupied & (self._high <= _EVEN * self._low))
+        even = even[np.argsort(self._low[even], kind="stable")]
+        found = {}
+        while even.size:
+            low, total = self._low[even], np.cumsum(np.append(0, self.cells[even]))
+            end = np.searchsorted(low, _EVEN * low, side="right")
+            first = int(np.argmax(total[end] - total[:-1]))
+            chosen = even[first : end[first]]
+            if (number := self.cells[chosen].sum()) < least:
+                break
+            middle = np.sqrt(self._low[chosen] * self._high[chosen])
+            found[float(np.average(middle, weights=self.cells[chosen]))] = float(number)
+            even = np.delete(even, slice(first, end[first]))
+        return found
+
+    def leave_out(self, sizes: Sequence[float]) -> None:
+        """Set the number of cells to 0 in boxes where h is one of `sizes`."""
+        self.cells[_which(sizes, self._low, self._high) < len(sizes)] = 0
+
+    def which_size(self, points: np.ndarray, sizes: Sequence[float]) -> np.ndarray:
+        """Return for each of `points` (n, d) the index of the first of `sizes` that h is, to one percent, (n,) int.
+
+        It is ``len(sizes)`` if h is none of them.
+        """
+        h = self.sizes(points)
+        return _which(sizes, h, h)
 
     def sizes(self, points: np.ndarray) -> np.ndarray:
         """Return h at `points` (n, d), (n,) float64.

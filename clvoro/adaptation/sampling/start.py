@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from numbers import Integral, Real
 from typing import Any, Protocol, runtime_checkable
 
@@ -185,8 +185,27 @@ def sample_uniform(domain: Domain, n: int, seed: int, real: DTypeLike = np.float
     return _in_all_pieces(domain, _distinct(draw, domain, np.empty((0, domain.dim)), n, np.dtype(real)))
 
 
-def sample_lattice(domain: Domain, n: int, seed: int) -> np.ndarray:
-    """Return those points of a body-centered cubic lattice that are inside, about `n` of them, (m, 3) float64.
+def sample_even(
+    tree: DensityTree, domain: Domain, n: int, seed: int, real: DTypeLike, sizes: Sequence[float]
+) -> np.ndarray:
+    """Return about `n` points: those of lattices where h is one of `sizes`, and of `sample_density` elsewhere.
+
+    - `tree`, `seed`, `real`: as for `sample_density`.
+    - `domain`: in space, flat.
+    - `sizes`: some of `DensityTree.even_sizes`.
+
+    The result is (m, 3) float64.
+    """
+    scale = (tree.integral / n) ** (1 / 3)
+    drawn = [sample_lattice(domain, scale * size, seed) for size in sizes]
+    tree.leave_out(sizes)
+    if others := round(tree.integral / scale**3):
+        drawn.append(sample_density(tree.field, domain, max(others, domain.n_pieces), seed, real, tree))
+    return _in_all_pieces(domain, np.concatenate([x[tree.which_size(x, sizes) == k] for k, x in enumerate(drawn)]))
+
+
+def sample_lattice(domain: Domain, h: float, seed: int) -> np.ndarray:
+    """Return the points of a body-centered cubic lattice of cells of size `h` that are inside, (m, 3) float64.
 
     The direction and the place of the lattice are random.
 
@@ -196,11 +215,9 @@ def sample_lattice(domain: Domain, n: int, seed: int) -> np.ndarray:
     - `domain`: in space, flat.
     - `seed`: seed of numpy's PCG64.
     """
-    n, seed = _check_arguments(n, seed)
     rng = np.random.Generator(np.random.PCG64(seed))
     axes, shift = np.linalg.qr(rng.standard_normal((3, 3)))[0], rng.random(3)
-    spacing = (domain.measure / n) ** (1 / 3)
-    edge, middle = 2 ** (1 / 3) * spacing, (np.array(domain.lower) + domain.upper) / 2
+    edge, middle = 2 ** (1 / 3) * h, (np.array(domain.lower) + domain.upper) / 2
     steps = np.arange(math.ceil(np.linalg.norm(domain.extent) / 2 / edge) + 2)
     steps = np.concatenate([-steps[:0:-1], steps])
     layer = np.stack(np.meshgrid(steps, steps, [0.0, 0.5], indexing="ij"), axis=-1).reshape(-1, 3)
@@ -210,7 +227,7 @@ def sample_lattice(domain: Domain, n: int, seed: int) -> np.ndarray:
         x = middle + edge * (layer + shift + (0, 0, z)) @ axes.T
         found.append(x[((x > domain.lower) & (x < domain.upper)).all(axis=1)])
     points = np.concatenate(found)
-    return _in_all_pieces(domain, points[_contained(domain, points, spacing)])
+    return points[_contained(domain, points, h)]
 
 
 def _contained(domain: Domain, points: np.ndarray, spacing: float) -> np.ndarray:

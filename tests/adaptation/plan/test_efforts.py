@@ -9,6 +9,7 @@ import pytest
 import clvoro
 from clvoro import sizing
 from clvoro.adaptation.plan.efforts import EFFORTS, EFFORTS_3D, choose_error_target, steep_share
+from clvoro.adaptation.plan.schedule import adaptive_schedule, n_steps
 from clvoro.adaptation.sampling.start import density_tree
 from clvoro.adaptation.tuning import SINGLE_LEVEL_ERROR_TARGET, STEEP, STEEPEST
 
@@ -103,6 +104,15 @@ def test_a_kinked_and_steep_field_gets_cells_of_a_good_shape(adapter):
     explicit = clvoro.MultilevelOptions(error_target=target)
     again = adapter.run(BOX, RIDGE, seed=31, options=explicit, max_steps=0)
     assert again.settings["error_target"] == target
+
+
+@pytest.mark.parametrize("effort", EFFORTS_3D)
+def test_few_cells_take_more_steps_from_a_lattice(effort):
+    cells = (500, 2000, 4000, 16_000, 10**6)
+    steps = [n_steps(adaptive_schedule(3, effort, 0, False, begins="lattice", cells=n)) for n in cells]
+    assert steps == sorted(steps, reverse=True)
+    assert steps[0] == steps[1] > steps[-1]
+    assert steps[0] < n_steps(adaptive_schedule(3, effort, 0, False)) + 16
 
 
 @pytest.mark.slow

@@ -9,7 +9,15 @@ from scipy.spatial import cKDTree
 from clvoro import Solid, sizing
 from clvoro.adaptation.sampling.box_tree import BoxTree, hilbert_tables
 from clvoro.adaptation.sampling.quadrature import DensityTree
-from clvoro.adaptation.sampling.start import _distinct, count_cells, sample_density, sample_lattice, sample_uniform
+from clvoro.adaptation.sampling.start import (
+    _distinct,
+    count_cells,
+    density_tree,
+    sample_density,
+    sample_even,
+    sample_lattice,
+    sample_uniform,
+)
 from clvoro.errors import InputError, InputTypeError
 from clvoro.geometry.box import Box
 from clvoro.opencl.engine import Engine
@@ -252,7 +260,10 @@ def test_uniform_is_plain_uniform():
 
 @pytest.mark.parametrize("name", ["box", "two balls", "torus", "outside"])
 def test_lattices_fill_domains(name):
-    """All points are off the walls, each has eight neighbors at the same distance, and others are farther."""
+    """All points are off the walls, each has eight neighbors at the same distance, and others are farther.
+
+    They are the start where sizes are the same in the whole domain.
+    """
     domains = {
         "box": Box((1, 2, 3), (2, 4, 3.5)),
         "two balls": Solid.ball((0, 0, 0), 1) + Solid.ball((3, 0, 0), 0.3),
@@ -260,8 +271,10 @@ def test_lattices_fill_domains(name):
         "outside": Solid.outside(Solid.ball((0, 0, 0), 0.5), Box((-1, -1, -1), (1, 1, 1))),
     }
     domain, n = domains[name], 8000
-    points = sample_lattice(domain, n, 3)
     spacing = (domain.measure / n) ** (1 / 3)
+    points = sample_lattice(domain, spacing, 3)
+    tree = density_tree(spacing, domain)
+    assert len(sample_even(tree, domain, round(tree.integral), 3, np.float64, (spacing,))) == len(points)
     assert domain.contains_well(points, 0.05 * spacing).all()
     # Points near walls are left out: a layer of 0.05 spacings, and their number scatters.
     assert len(points) == pytest.approx(n, rel=0.03)
@@ -272,13 +285,51 @@ def test_lattices_fill_domains(name):
     edge = 2 ** (1 / 3) * spacing
     assert np.allclose(near[:, :8], edge * 3**0.5 / 2, rtol=1e-9)
     assert np.allclose(near[:, 8], edge, rtol=1e-6)
-    assert np.array_equal(points, sample_lattice(domain, n, 3))
-    assert not np.array_equal(points, sample_lattice(domain, n, 4))
+    assert np.array_equal(points, sample_lattice(domain, spacing, 3))
+    assert not np.array_equal(points, sample_lattice(domain, spacing, 4))
 
 
-@pytest.mark.parametrize(("size", "uniform"), [("0.05", True), ("0.05 + 0.0003*x", True), ("0.05 + 0.01*x", False)])
-def test_uniform_sizes_are_noticed(size, uniform):
-    assert DensityTree(sizing.Expression(size), CUBE).is_uniform == uniform
+@pytest.mark.parametrize(
+    ("size", "expected"),
+    [
+        ("0.05", {0.05: 8000}),
+        ("0.05 + 0.0003*(x - 1)", {0.05015: 7928}),
+        ("0.05 + 0.01*(x - 1)", {}),
+        ("fmin(0.1, 0.05 + fmax(x - 1.25, 0)/2)", {0.05: 2000, 0.1: 650}),
+        ("x < 1.25 ? 0.04 : 0.05", {0.05: 6000, 0.04: 3906}),
+    ],
+)
+def test_even_sizes_are_found(size, expected):
+    found = DensityTree(sizing.Expression(size), CUBE).even_sizes(500)
+    assert list(found) == pytest.approx(list(expected), rel=1e-3)
+    assert list(found.values()) == pytest.approx(list(expected.values()), rel=0.05)
+
+
+@pytest.mark.parametrize("name", ["two balls", "outside"])
+def test_lattices_are_where_sizes_are_the_same(name):
+    """Elsewhere points are random. There are as many as the sizes ask for."""
+    small = Solid.ball((3, 0, 0), 0.1)
+    domain = {
+        "two balls": Solid.ball((2.2, 0, 0), 0.6) + small,
+        "outside": Solid.outside(small, Box((1.8, -0.5, -0.5), (3.2, 0.5, 0.5))),
+    }[name]
+    field = sizing.Expression("0.05 + fmin(0.03, fmax(0, 0.2*(2.4 - x)))")
+    tree = density_tree(field, domain)
+    n = 2 * round(tree.integral)
+    sizes = tuple(tree.even_sizes(300))
+    assert sorted(sizes) == pytest.approx([0.05, 0.08], rel=1e-3)
+    points = sample_even(tree, domain, n, 3, np.float64, sizes)
+    expected = 2 * domain.measure * (field(sample_uniform(domain, 50_000, 1)) ** -3).mean()
+    assert len(points) == pytest.approx(expected, rel=0.04)
+    assert np.unique(domain.piece_of(points)).size == domain.n_pieces
+    near, those = cKDTree(points).query(points, k=10)
+    spacing, h = 2 ** (-1 / 3) * field(points), field(points)
+    of_lattice = np.abs(near[:, 1:9] - 2 ** (1 / 3) * 3**0.5 / 2 * spacing[:, None]).max(axis=1) < 3e-3 * spacing
+    for size in sizes:
+        inner = (np.abs(h[those] / size - 1) < 0.009).all(axis=1) & domain.contains_well(points, 1.2 * size)
+        assert np.count_nonzero(inner) > 50
+        assert of_lattice[inner].mean() > 0.8
+    assert not of_lattice[np.abs(h[:, None] / sizes - 1).min(axis=1) > 0.02].any()
 
 
 @pytest.mark.sparse(2)
