@@ -68,7 +68,7 @@ def test_cases_on_pages_run(page, tmp_path, monkeypatch):
         Case.from_toml(block, page)
         path = tmp_path / f"case{number}.toml"
         path.write_text(block)
-        run = ["run", str(path), "--steps", "1", "--cells", "200", "--no-report", "--quiet"]
+        run = ["run", str(path), "--steps", "1", "--cells", "100", "--no-report", "--quiet"]
         assert command.main(run) == command.OK
 
 

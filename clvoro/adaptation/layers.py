@@ -14,6 +14,7 @@ from ..geometry.boundary_layers import LayerPrisms, LayerRows, Layers, PlacedLay
 from ..geometry.domain import Domain
 from ..geometry.shapes import Edges
 from ..opencl.engine import Engine
+from ..sizing import Sizing
 from ..sizing.distance import Distance
 from ..sizing.field import Field, maximum, minimum
 from .estimates import check_memory
@@ -134,9 +135,10 @@ def _beside_borders(engine: Engine, domain: Domain, free: Domain, field: Field, 
 
     Places are narrow for the cells of the run: with `n_cells` all sizes are scaled to have that number.
     """
+    assert domain.borders is not None
     limited, factor = field, 1.0
     for _ in range(1 if n_cells is None else _ROUNDS):
-        cells = density_tree(limited, free).integral
+        cells = density_tree(Sizing(engine, domain, limited), free).integral
         if n_cells is not None:
             cells, factor = n_cells, (cells / n_cells) ** (1 / domain.cell_dim)
         check_memory(engine, cells, domain)  # before borders have generators

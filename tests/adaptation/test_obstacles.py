@@ -17,7 +17,12 @@ BOTH = clvoro.Box((0, 0), (2, 1), periodic=True)
 def mesh(ctx):
     domain = BOTH.without([clvoro.curves.circle((0, 0), 0.2, name="tube"), WEDGE])
     size = clvoro.sizing.Distance(domain.holes, 0.04, growth=1.2, h_max=0.1)
-    return domain, clvoro.Adapter(ctx).run(domain, size, "fast", seed=1)
+    evaluated, on_host = [], type(size)._evaluate
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(type(size), "_evaluate", lambda field, x: evaluated.append(len(x)) or on_host(field, x))
+        found = clvoro.Adapter(ctx).run(domain, size, "fast", seed=1)
+    assert sum(evaluated) < 5_000  # cells are counted on the device
+    return domain, found
 
 
 def test_a_mesh_ends_at_holes_across_seams(mesh):

@@ -265,12 +265,12 @@ def test_lattices_fill_domains(name):
     They are the start where sizes are the same in the whole domain.
     """
     domains = {
-        "box": Box((1, 2, 3), (2, 4, 3.5)),
-        "two balls": Solid.ball((0, 0, 0), 1) + Solid.ball((3, 0, 0), 0.3),
-        "torus": Solid.torus((0, 0, 0), 1, 0.4),
-        "outside": Solid.outside(Solid.ball((0, 0, 0), 0.5), Box((-1, -1, -1), (1, 1, 1))),
+        "box": lambda: Box((1, 2, 3), (2, 4, 3.5)),
+        "two balls": lambda: Solid.ball((0, 0, 0), 1) + Solid.ball((3, 0, 0), 0.3),
+        "torus": lambda: Solid.torus((0, 0, 0), 1, 0.4, edge=0.1),
+        "outside": lambda: Solid.outside(Solid.ball((0, 0, 0), 0.5), Box((-1, -1, -1), (1, 1, 1))),
     }
-    domain, n = domains[name], 8000
+    domain, n = domains[name](), 8000
     spacing = (domain.measure / n) ** (1 / 3)
     points = sample_lattice(domain, spacing, 3)
     tree = density_tree(spacing, domain)
