@@ -262,16 +262,24 @@ def require_space(diagram: Diagram) -> None:
 
 
 def focus(result: Result) -> np.ndarray:
-    """Return the point that pictures of a 3D mesh show: among its smallest cells, well inside the domain."""
+    """Return the point that pictures of a 3D mesh show: among its smallest cells, well inside the domain.
+
+    The planes through it along the axes intersect cells, also where the domain has several pieces.
+    """
     box = result.diagram.domain
     smallest = result.points[result.target_size <= 1.1 * result.target_size.min()]
     lower, extent = np.array(box.lower), box.extent
-    if len(smallest) > 0.5 * len(result.points):  # a uniform mesh
-        return lower + 0.5 * extent
-    # A round number for the titles; half a cell makes no difference.
-    step = nice(0.5 * float(result.target_size.min()), up=False)
-    center = np.round(smallest.mean(axis=0) / step) * step + 0.0
-    return np.clip(center, lower + 0.25 * extent, lower + 0.75 * extent)
+    center = lower + 0.5 * extent
+    if len(smallest) <= 0.5 * len(result.points):  # not a uniform mesh
+        # A round number for the titles; half a cell makes no difference.
+        step = nice(0.5 * float(result.target_size.min()), up=False)
+        center = np.round(smallest.mean(axis=0) / step) * step + 0.0
+        center = np.clip(center, lower + 0.25 * extent, lower + 0.75 * extent)
+    d = result.diagram
+    corners, starts = d.vertices[d.face_vertices], d.face_vertex_starts[:-1]
+    met = (np.minimum.reduceat(corners, starts) < center) & (center < np.maximum.reduceat(corners, starts))
+    nearest = np.abs(d.centroids - center).argmin(axis=0)
+    return np.where(met.any(axis=0), center, d.centroids[nearest, np.arange(3)])
 
 
 def as_normal(normal: str | ArrayLike) -> np.ndarray:

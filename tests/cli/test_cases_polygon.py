@@ -118,6 +118,7 @@ def test_sizes_from_the_boundary() -> None:
     ("text", "says"),
     [
         ("[domain]\npolygon = 3\n", "domain.file is 3"),
+        ("[domain]\nsolid = 'a.stl'\nunit = 'mm'\n", "did you mean 'units'.*; it takes solid, units"),
         ("[domain]\npolygon = 'none.geojson'\n", "cannot read none.geojson"),
         ("[domain]\npolygon = 'none.wkt'\n", "cannot read none.wkt"),
         ("[domain]\npolygon = 'a.geojson'\nholes = [[[0, 0], [1, 0], [1, 1]]]\n", "both a file and holes"),

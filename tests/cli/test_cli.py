@@ -392,6 +392,7 @@ def pressing_run(number):
     [
         (["run", "papre"], cli.BAD_INPUT, "did you mean 'paper'"),
         (["run", "part.STL"], cli.BAD_INPUT, "solid = 'part.STL' below [domain]"),
+        (["run", "part.stl.gz"], cli.BAD_INPUT, "solid = 'part.stl.gz' below [domain]"),
         (["run", "small.toml", "--steps", -1], cli.BAD_INPUT, "run.max_steps is -1"),
         (["run", "small.toml", "--method", "magic"], cli.BAD_INPUT, "magic"),
         (["run", "small.toml", "--out", "small.toml"], cli.BAD_INPUT, "folder cannot be created"),

@@ -10,7 +10,7 @@ from matplotlib.collections import PolyCollection
 from matplotlib.path import Path
 from scipy.spatial import cKDTree
 
-from clvoro import Adapter, Box, Solid
+from clvoro import Adapter, Box, Solid, voronoi
 from clvoro.errors import ClvoroError, InputError, MissingPicturesWarning
 from clvoro.plotting import (
     page,
@@ -207,6 +207,12 @@ def test_focus_is_amid_the_smallest_cells_and_inside(result):
     assert focus(corner) == pytest.approx(np.array(LOWER) + 0.25 * Box(LOWER, UPPER).extent)
     alike = dataclasses.replace(result, target_size=np.ones(150))
     assert focus(alike) == pytest.approx(np.add(LOWER, UPPER) / 2)
+
+
+def test_slices_meet_cells_of_pieces_on_both_sides_of_the_center():
+    pieces = Solid.box((0, 0, 0), (1, 1, 1)) + Solid.box((2, 2, 2), (3, 3, 3))
+    mesh = voronoi(pieces, np.random.default_rng(1).random((20, 3)) + np.repeat([[0], [2]], 10, axis=0))
+    assert all(ax.collections for ax in plot_slices(mesh, "volume").axes[:3])
 
 
 def test_distributions_are_complete(result):

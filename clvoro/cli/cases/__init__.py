@@ -173,7 +173,7 @@ def _files(node: Any) -> Iterator[tuple[Any, Any]]:
         if isinstance(item, (dict, list)):
             yield from _files(item)
     if isinstance(node, dict):
-        for key in ("file", "points", "fixed", "land", "lines", "shapes", "surfaces"):
+        for key in ("file", "solid", "points", "fixed", "land", "lines", "shapes", "surfaces"):
             value = node.get(key)
             if isinstance(value, str):
                 yield node, key
@@ -224,7 +224,7 @@ def load_case(name: str | Path) -> Case:
     if str(name) in known:
         return Case.from_toml(known[str(name)], str(name))
     path = Path(name)
-    if key := GEOMETRIES.get(path.suffix.lower()):
+    if key := GEOMETRIES.get(Path(path.name.lower().removesuffix(".gz")).suffix):
         unit = "; for sizes in meters, add units = 'mm' if the file is in millimeters" * (key == "solid")
         raise InputError(
             f"{str(name)!r} is a geometry, expected a case: write a file .toml with {key} = {path.name!r} below "

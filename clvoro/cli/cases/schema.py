@@ -649,7 +649,7 @@ class Around(Table):
     names: Names | None = None
 
 
-class SolidTable(Kind, tag="solid"):
+class SolidTable(Kind, tag="solid", rename={"file": "solid"}):
     """The inside of a surface from one file or several, or with `outside` the region of a box around it."""
 
     file: Text | Annotated[list[Text], Meta(min_length=1)]
@@ -684,7 +684,7 @@ def with_kind(domain: object, place: str) -> object:
     if not isinstance(domain, Mapping) or "kind" in domain:
         return domain
     if "solid" in domain and not {"lower", "upper", "polygon", "outer"} & set(domain):
-        return {"kind": "solid", **{"file" if key == "solid" else key: value for key, value in domain.items()}}
+        return {"kind": "solid", **domain}
     corners = [key for key in ("lower", "upper", "periodic") if key in domain]
     rings = [key for key in ("polygon", "outer") if key in domain]
     if corners and rings:

@@ -22,6 +22,7 @@ _APART = 1e-6  # of the diagonal: how far from a triangle its two sides are exam
 _LARGEST_GAP = 1e-3  # of the diagonal: gaps that `join` may close
 _SHARPEST = 10.0  # degrees
 _VOXELS = 50, 10  # patches of a surface of voxels at least, and sides of voxels in half of its patches at most
+_PLANES = 5  # of a surface of voxels along each axis at least
 _NAMED = 3  # pairs of parts with open edges that a message names
 _OR_WRAP = "Or pass wrap=, two thirds of the size of cells, for a closed surface around all triangles"
 
@@ -184,6 +185,8 @@ def voxel_width(vertices: np.ndarray, normals: np.ndarray, areas: np.ndarray, pa
     for axis, x in enumerate(vertices.T):
         gaps = np.diff(np.unique(x))
         gaps = gaps[gaps > _APART * np.ptp(x)]
+        if len(gaps) < _PLANES - 1:  # a profile of steps, such as a heat sink
+            return None
         widths[axis] = gaps.min()
         if np.abs(gaps / widths[axis] - np.rint(gaps / widths[axis])).max() > _FLAT:
             return None

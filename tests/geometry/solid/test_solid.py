@@ -5,8 +5,9 @@ import warnings
 
 import numpy as np
 import pytest
+import shapely
 
-from clvoro import Solid
+from clvoro import Polygon, Solid
 from clvoro.errors import InputError, MismatchWarning
 from clvoro.geometry.columns import Columns
 from clvoro.geometry.triangles import packed_rows, packed_weights, pierced
@@ -176,6 +177,8 @@ def test_voxels_are_recognized_and_have_a_remedy():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert Solid(vertices, triangles[:, ::-1], angle=60).measure == pytest.approx(mask.sum(), rel=0.15)
+        fins = shapely.union_all([shapely.box(0, -5, 60, 0), *(shapely.box(x, -5, x + 1, 25) for x in range(2, 60, 4))])
+        assert Solid.extruded(Polygon.from_shapely(fins), 0, 50).n_patches > 50  # a heat sink
 
 
 @pytest.mark.parametrize(
