@@ -102,7 +102,7 @@ def _plot_in_space(domain: Domain, numbers: bool) -> Any:
     normals = np.cross(pieces[:, 1] - pieces[:, 0], pieces[:, 2] - pieces[:, 0])
     areas = np.linalg.norm(normals, axis=1) / 2
     normals /= np.maximum(2 * areas, 1e-300)[:, None]
-    outwards = -1 if fills_box(domain, pieces, areas) else 1
+    outwards = -1 if fills_box(domain, cast("Any", pieces), areas) else 1
     hues = (_hues(domain)[wall] if numbers else domain.boundary_index[wall]) % len(METHOD_COLORS)
     figure = interactive_figure(WIDTH, WIDTH / 2)
     hidden = set(walls.tolist())
@@ -114,7 +114,8 @@ def _plot_in_space(domain: Domain, numbers: bool) -> Any:
         frame_domain(ax, flat.min(axis=(0, 1)), flat.max(axis=(0, 1)), ticks=False)
         ax.set_axis_off()
         colors = (0.4 + 0.6 * _HUES[hues[shown]]) * brightness(outwards * normals[shown], angles)[:, None]
-        drawn = PolyCollection(list(flat[shown]), facecolors=colors, edgecolors=colors, linewidths=0.3, rasterized=True)
+        seen: Any = flat[shown]  # an array takes half the time of a list
+        drawn = PolyCollection(seen, facecolors=colors, edgecolors=colors, linewidths=0.3, rasterized=True)
         ax.add_collection(drawn, autolim=False)
         placed = np.zeros((0, 2))
         for k, place in _places(flat[shown], wall[shown], domain).items() if numbers else ():
@@ -152,7 +153,7 @@ def _pieces(corners: np.ndarray, wall: np.ndarray, domain: Domain) -> tuple[np.n
     except ModuleNotFoundError as error:
         raise missing("trimesh", "solids", "a picture of the boundary in 3D") from error
     most = float(domain.extent.max()) / _PARTS
-    vertices, faces, origin = subdivide_to_size(
+    vertices, faces, origin = cast("Any", subdivide_to_size)(
         corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3), most, max_iter=20, return_index=True
     )
     return vertices[faces], wall[origin]
