@@ -84,6 +84,22 @@ typedef struct {
         quality_scale, wall_penalty, wall_quality_scale, log_ratio_scale, power, mean_partial, mean_groups, labels,    \
         fixed, start
 
+/* Whether cell i is on a wall. */
+inline bool is_on_wall(int i, int faces, global const int *starts, global const int *neighbors)
+{
+    bool found = false;
+    for (int k = starts[i], end = starts[i + 1]; k < end && !found; k += AT_ONCE)
+        found = ANY(INSIDE(k, end) & (TAKE(int, neighbors, k, faces) < 0));
+    return found;
+}
+
+/* One work-item per cell: note in p, which is free until the first direction, which cells are on walls, for solids. */
+kernel void mark_walls(const int size, global const int *starts, global const int *neighbors, global STORE *p)
+{
+    WORK_ITEM(i);
+    p[i] = is_on_wall(i, starts[size], starts, neighbors);
+}
+
 /* Assemble the operator and the right side, one work-item per generator i of a block:
 
      own[i] = dr_i/dx_i h_i      rows[k] = dr_i/dx_j h_j      columns[k] = dr_j/dx_i h_i   for face k = (i, j)
@@ -107,7 +123,7 @@ inline void assemble_rows(ITERATION_ARGS, ASSEMBLY_ARGS PERIOD_ARGS, group_t gro
         const REAL per_face = CELL_DIM == 2 ? unit : unit * unit;
         const float shrink = content / volumes[i];
         float diagonal = 0, least_quality = quality[i];
-        bool on_wall = false;
+        bool on_wall = false, beside_wall = false;
         const bool is_fixed = fixed > 0 && labels[i] < fixed;
         EACH_AXIS (a)
             x[a] = points[DIM * i + a];
@@ -123,6 +139,9 @@ inline void assemble_rows(ITERATION_ARGS, ASSEMBLY_ARGS PERIOD_ARGS, group_t gro
             const MANY(int) facing = TAKE(int, neighbors, k, faces), counts = INSIDE(k, end) & (facing >= 0);
             const MANY(int) j = select((MANY(int))(i), facing, counts);
             on_wall = on_wall || ANY(INSIDE(k, end) & (facing < 0));
+#ifdef OWN_WALLS
+            beside_wall = beside_wall || ANY(CONVERT(int, PICK(STORE, p, j, 1, 0)) > 0);
+#endif
             MANY(float) d[DIM], d2 = 0, square = 0, displaced = 0, middle[DIM], other[DIM];
 #ifdef SPHERE
             MANY(float) there_at[DIM];
@@ -171,28 +190,31 @@ inline void assemble_rows(ITERATION_ARGS, ASSEMBLY_ARGS PERIOD_ARGS, group_t gro
         }
 #ifdef OWN_WALLS
         /* Walls cut each cell by itself, so that the face of the cell across may differ. Derivatives are the means of
-           those by both faces: else B^T were not the transpose of B, and the iteration could diverge. */
-        diagonal = 0;
-        for (int k = starts[i]; k < end; ++k) {
-            const int j = neighbors[k], back = j < 0 ? -1 : find_entry(i, j, faces - 8, starts, neighbors);
-            if (back < 0)
-                continue;
-            REAL away[3], square = 0;
-            EACH_AXIS (a) {
-                away[a] = x[a] - points[3 * j + a];
-                square += away[a] * away[a];
+           those by both faces: else B^T were not the transpose of B, and the iteration could diverge. Faces between
+           cells that no wall cuts are the same from both sides. */
+        diagonal = beside_wall ? 0 : diagonal;
+        for (int k = starts[i]; beside_wall && k < end; ++k) {
+            const int j = neighbors[k];
+            const int back = j < 0 || !(on_wall || p[j] > 0) ? -1 : find_entry(i, j, faces - 8, starts, neighbors);
+            if (back >= 0) {
+                REAL away[3], square = 0;
+                EACH_AXIS (a) {
+                    away[a] = x[a] - points[3 * j + a];
+                    square += away[a] * away[a];
+                }
+                const REAL w = R(0.5) * face_measures[back] / sqrt(square);
+                const REAL here = fixed > 0 && labels[j] < fixed ? 0 : w * h[j] / volumes[i];
+                const REAL there = is_fixed ? 0 : w * hi / volumes[j];
+                EACH_AXIS (a) {
+                    const int at = a * room + k;
+                    const REAL m = face_centroids[3 * back + a], more = -here * m - R(0.5) * rows[at];
+                    rows[at] += more;
+                    columns[at] = R(0.5) * columns[at] + there * (away[a] - m);
+                    change += more * displacement[3 * j + a] / h[j];
+                }
             }
-            const REAL w = R(0.5) * face_measures[back] / sqrt(square);
-            const REAL here = fixed > 0 && labels[j] < fixed ? 0 : w * h[j] / volumes[i];
-            const REAL there = is_fixed ? 0 : w * hi / volumes[j];
-            EACH_AXIS (a) {
-                const int at = a * room + k;
-                const REAL m = face_centroids[3 * back + a], more = -here * m - R(0.5) * rows[at];
-                rows[at] += more;
-                columns[at] = R(0.5) * columns[at] + there * (away[a] - m);
-                change += more * displacement[3 * j + a] / h[j];
-                diagonal += rows[at] * rows[at];
-            }
+            EACH_AXIS (a)
+                diagonal += rows[a * room + k] * rows[a * room + k];
         }
 #endif
         float slope[DIM], moved[DIM];
@@ -373,6 +395,11 @@ kernel void write_correction(const int size, global const STORE *u, global const
 kernel void project_by_group(ITERATION_ARGS, global REAL *correction, ASSEMBLY_ARGS PERIOD_ARGS)
 {
     LONG_GROUP;
+#ifdef OWN_WALLS
+    for (GROUP_LOOP(i, n))
+        p[i] = is_on_wall(i, starts[n], starts, neighbors);
+    GROUP_BARRIER;
+#endif
     assemble_rows(ITERATION, ASSEMBLY PERIODS, group);
     GROUP_BARRIER;
     const iteration_t it = {ITERATION};

@@ -172,6 +172,8 @@ class VolumeProjection:
             solution = SolutionToRead(lambda: self._solution(self._read(most), limits.tolerance))
             self._unread = ref(solution)
             return solution
+        if "OWN_WALLS" in engine.traits.macros:
+            engine.run_each(k.mark_walls, n, *t.graph, v.p)
         Launch(engine, k.assemble_projection, *given, self._counts, *rest)()
         direction = Launch(engine, k.update_projection_direction, *given, self._counts)
         update = Launch(engine, k.update_projection, *given, self._counts)
