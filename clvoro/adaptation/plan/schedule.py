@@ -117,11 +117,12 @@ def adaptive_schedule(
     def planned(effort: Effort) -> list[Action]:
         if begins == "near":
             return list(_correction(dim, effort, exact, error_target))
-        if dim == 3:
-            return list(_adaptive_3d(effort, levels, exact, error_target, begins, cells))
-        return list(_adaptive_2d(effort, levels, exact, error_target, begins))
+        return list({2: _adaptive_2d, 3: _adaptive_3d}[dim](effort, levels, exact, error_target, begins))
 
     settings = EFFORTS_OF[dim][effort]
+    if begins == "lattice":
+        share = tuning.LATTICE_GLIDE * min(1 + (tuning.LATTICE_CELLS / cells) ** 2, tuning.MOST_GLIDE)
+        settings = replace(settings, alone=max(int(share * settings.alone) - settings.glide, 0), coarse_polish=0)
     schedule = planned(settings)
     while most is not None and begins != "random" and levels == 0 and n_steps(schedule) > most:
         name = "alone" if settings.alone else "coarse_polish"
@@ -289,9 +290,7 @@ def _finish_2d(effort: Effort, exact: bool, error_target: float, penalty: float)
         yield from [Step(separate)] * effort.separate
 
 
-def _adaptive_3d(
-    effort: Effort, levels: int, exact: bool, error_target: float, begins: Begins, cells: float
-) -> Iterator[Action]:
+def _adaptive_3d(effort: Effort, levels: int, exact: bool, error_target: float, begins: Begins) -> Iterator[Action]:
     warm = begins != "random"
     couple = [Step(COUPLE)]
     coarse_glide = _glide_3d(effort, tuning.COARSE_PENALTY, tuning.COARSE_TOLERANCE)
@@ -310,11 +309,7 @@ def _adaptive_3d(
                 yield from couple * steps
                 yield CorrectCount(tuning.COUNT_LEAST, tuning.POLISH_GROWTH_3D)
             yield from couple * effort.recouple
-        if begins == "lattice":
-            share = tuning.LATTICE_GLIDE * min(1 + (tuning.LATTICE_CELLS / cells) ** 2, tuning.MOST_GLIDE)
-            yield from [Step(coarse_glide)] * max(int(share * effort.alone) - effort.glide, 0)
-            yield ResetMomentum()
-        elif level or (not levels and begins != "mesh"):
+        if level or (not levels and begins != "mesh"):
             yield from [Step(coarse_glide)] * (effort.coarse_glide if levels else effort.alone)
             yield from [Step(coarse_polish)] * effort.coarse_polish
             yield ResetMomentum()
