@@ -189,7 +189,7 @@ class Tessellator:
                 continue
             found = steps.finish(part, t, points, exact, nearest)
             enough = found is not None
-            if found is not None and (whole or not complete):
+            if found is not None and (whole or not complete or found.part is not None):
                 return found if found.part is not None else replace(found, points=points, sites=sites)
             # Memory for the new diagram.
             del part, binned, t
