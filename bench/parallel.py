@@ -75,9 +75,9 @@ MODEL = {2: (4.0e8, 22, 16, 8, 3.8), 3: (1.14e7, 22, 19, 26, 2.9)}
 """Of a step, by the dimension: cells that an H200 does in a second ("On a GPU" in RESULTS.md; in 3D those of an update,
 most of a step); exchanges, and sums, as in the table "Ranks"; assumed neighbors of a part; measured ghosts over one
 layer around a part."""
-BANDWIDTH, LATENCY, COPY, SEARCH, STEPS = 2.5e10, 2e-6, 5.7e-5, 2e-7, 5
-"""Assumed: bytes in a second, over the network and between host and device; seconds of a message. Measured: seconds of
-a copy between an H200 and its host; of the search for ghosts on the host, for each cell; steps between searches."""
+BANDWIDTH, LATENCY, COPY, SEARCH = 2.5e10, 2e-6, 5.7e-5, {2: 4e-8, 3: 2e-7}
+"""Assumed: bytes in a second, over the network and to the host; seconds of a message. Measured: seconds of a copy
+between an H200 and its host; of the search for ghosts per cell and step (4e-7 and 1e-6 every 10 and 5 steps)."""
 MODEL_COLUMNS = {
     "GPUs": shown("parts", ",d"),
     "cells": shown("cells", ".1e"),
@@ -94,7 +94,7 @@ def model(dim: int, own: float, parts: int) -> dict[str, float]:
     # Values of 8 bytes go to the host, over the network and to the device; positions once, of 8 bytes for each axis.
     moved = 3 * 8 * ghosts * (exchanges + dim - 1) / BANDWIDTH
     waits = exchanges * (neighbors * LATENCY + 2 * COPY) + sums * (2 * np.log2(parts) * LATENCY + 2 * COPY)
-    of_step = {"compute": (own + ghosts) / rate, "bytes": moved, "latency": waits, "search": own * SEARCH / STEPS}
+    of_step = {"compute": (own + ghosts) / rate, "bytes": moved, "latency": waits, "search": own * SEARCH[dim]}
     of_step = of_step if parts > 1 else dict.fromkeys(of_step, 0.0) | {"compute": own / rate}
     shares = {"ghosts": ghosts / own, "efficiency": own / rate / sum(of_step.values())}
     return {"parts": parts, "cells": own * parts, **of_step, **shares}
