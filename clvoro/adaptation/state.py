@@ -478,14 +478,14 @@ class MeshState:
     def sizes_over_mesh(self) -> np.ndarray | None:
         """Return the factors by which cells are larger on the device than in the mesh, which differs at curved walls.
 
-        (n,), in the order of rows; 1 where the mesh lacks the cell. None if all walls are straight.
+        (n,), in the order of rows; infinite where the mesh lacks the cell. None if all walls are straight.
         """
         volumes = self.tessellator.steps.volumes_of_mesh(self.t, self.labels)
         if volumes is None:
             return None
         here = self.to_host(self.t.volumes, self.domain.frame[1] ** 3)
         factors = np.empty(self.n)
-        factors[self._order] = np.where(volumes > 0, np.cbrt(here / np.where(volumes > 0, volumes, 1)), 1)
+        factors[self._order] = np.where(volumes > 0, np.cbrt(here / np.where(volumes > 0, volumes, 1)), np.inf)
         return factors.astype(self.engine.real)
 
     def insert_delete(
@@ -509,6 +509,14 @@ class MeshState:
             return self.stages.insertion_deletion.insert_delete(self.present, sizes, change)
 
         return self._replace_by(changed)
+
+    def delete_lost(self, lost: np.ndarray) -> int:
+        """Delete generators that are not fixed where `lost` (n,) is true; return their number."""
+        sites = np.zeros((2, self.t.rows), np.uint64)
+        sites[1, : self.n] = lost & (self.labels.get()[: self.n] >= self.fixed)
+        none, chosen = (self.engine.upload(which, np.uint64) for which in sites)
+        split_delete = self.stages.insertion_deletion.split_delete
+        return self._replace_by(lambda: split_delete(self.present, (none, chosen)))[1]
 
     def repair_cells(self, deficit: float, split: bool) -> tuple[int, int]:
         """Delete or split the worst cells (see `InsertionDeletion.repair_cells`); return the numbers of both."""

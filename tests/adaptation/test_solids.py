@@ -118,3 +118,28 @@ def test_what_solids_do_not_have_is_refused(ctx):
         adapter.transport(cube, [(0.3, 0.5, 0.5), (0.7, 0.5, 0.5)], [0.5, 0.5])
     with pytest.raises(InputError, match="leave out `periodic`"):
         clvoro.Solid.outside(cube, clvoro.Box((-1, -1, -1), (2, 2, 2), periodic=True))
+
+
+def test_generators_without_a_cell_in_the_mesh_are_deleted(ctx, monkeypatch):
+    """Fixed ones stay."""
+    own, delete, seen = MeshState.sizes_over_mesh, MeshState.delete_lost, {}
+
+    def sizes_over_mesh(mesh):
+        factors = own(mesh)
+        assert np.isfinite(factors).all()
+        labels = mesh.labels.get()[: mesh.n]
+        lost = np.isin(labels, [0, *labels[labels >= mesh.fixed][:3]])
+        factors[lost] = np.inf
+        seen.update(n=mesh.total, lost=labels[lost])
+        return factors
+
+    def delete_lost(mesh, lost):
+        count = delete(mesh, lost)
+        seen.update(count=count, left=seen["n"] - mesh.total, kept=np.isin(seen["lost"], mesh.labels.get()))
+        return count
+
+    monkeypatch.setattr(MeshState, "sizes_over_mesh", sizes_over_mesh)
+    monkeypatch.setattr(MeshState, "delete_lost", delete_lost)
+    clvoro.Adapter(ctx).run(corner(), H, "fast", method="exact")
+    assert seen["count"] == seen["left"] == 3
+    assert np.array_equal(seen["lost"][seen["kept"]], [0])

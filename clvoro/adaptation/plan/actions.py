@@ -6,6 +6,8 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
+import numpy as np
+
 from ..estimates import MOST_SURPLUS
 from ..motion import Displacement, Method
 from ..tuning import CLIMB_STRAIN, LEAST_PROGRESS, MAX_BALANCES, MAX_OSCILLATIONS, SAMPLING_GAIN
@@ -58,8 +60,8 @@ class Step:
 class CountOfMesh:
     """Correct the number of generators for the cells of the resulting mesh.
 
-    At curved walls the cells on the device are cut by planes, while those of the mesh end at the surface. With a fixed
-    number of cells nothing is done.
+    At curved walls the cells on the device are cut by planes, while those of the mesh end at the surface. Generators
+    that have no cell there, in parts thinner than a cell, are deleted. With a fixed number of cells nothing is done.
     """
 
     def apply(self, run: Run) -> None:
@@ -74,6 +76,7 @@ class CountOfMesh:
         mesh.h.set(h)
         if lack:
             mesh.stages.clear_poisson()
+            lack += mesh.delete_lost(np.isinf(factors))
             mesh.insert_delete(0, mesh.total + lack, climb=False, most=max_cells(run))
 
 
