@@ -50,7 +50,7 @@ def charted(
 _ATTEMPTS = 60  # the last 40 halve the distance of a point from one that is inside
 _ULPS = 4  # least distance of points from the boundary of a polygon
 _MAX_BOXES = 1 << 15  # over a polygon, for uniform points
-_MAX_EXPECTED = 1.0  # points per box
+_MAX_EXPECTED, _MAX_EXPECTED_BESIDE = 1.0, 8.0  # points per box; beside lattices
 _TOLERANCE = 1e-3  # relative error of the integral in the tree for sampling
 _DEPTH = 0.05  # least distance of a lattice's points from walls, over their spacing
 _CUBE = 4.0  # side of cubes of a lattice's points, over their spacing
@@ -108,7 +108,13 @@ def sample_density(
 
 
 def replace_far(
-    points: np.ndarray, tree: DensityTree, domain: Domain, n: int, seed: int, real: DTypeLike
+    points: np.ndarray,
+    tree: DensityTree,
+    domain: Domain,
+    n: int,
+    seed: int,
+    real: DTypeLike,
+    most: float = _MAX_EXPECTED,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Replace `points` by those of `sample_density` where their number is far from that of the density.
 
@@ -118,6 +124,7 @@ def replace_far(
 
     - `points` (k, d) float64: inside the domain.
     - `tree`, `domain`, `n`, `seed`, `real`: as for `sample_density`.
+    - `most`: most expected points of a box.
 
     Results:
     - (m, d) float64: those of `points` that are kept, then new ones. Without points, or if none is kept, these are the
@@ -130,7 +137,7 @@ def replace_far(
         return np.concatenate([points[rows], chart.position(found[len(rows) :])]), rows
     boxes, coverage, slopes = tree.boxes, tree.coverage, tree.slopes
     share = tree.cells * (n / tree.integral)
-    while (chosen := (share > _MAX_EXPECTED) & (boxes.level < 45)).any():
+    while (chosen := (share > most) & (boxes.level < 45)).any():
         share, slopes = _halve(tree, chosen, share, slopes)
     reached = np.cumsum(share)
     rng = np.random.Generator(np.random.PCG64(seed))
@@ -200,7 +207,8 @@ def sample_even(
     drawn = [sample_lattice(domain, scale * size, seed) for size in sizes]
     tree.leave_out(sizes)
     if others := round(tree.integral / scale**3):
-        drawn.append(sample_density(tree.field, domain, max(others, domain.n_pieces), seed, real, tree))
+        n, none = max(others, domain.n_pieces), np.empty((0, 3))
+        drawn.append(replace_far(none, tree, domain, n, seed, real, _MAX_EXPECTED_BESIDE)[0])
     return _in_all_pieces(domain, np.concatenate([x[tree.which_size(x, sizes) == k] for k, x in enumerate(drawn)]))
 
 
