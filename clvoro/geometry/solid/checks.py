@@ -18,6 +18,7 @@ from .combining import boolean, library
 from .creases import connect, pair_sides, triangle_normals
 
 _FLAT = 1e-3  # of the extent of a hole: how far it may deviate from a plane; of a voxel: from a lattice
+_UNEVEN, _SMALL = 0.05, 0.5  # the same of holes up to half as large as their part: the ends of scanned vessels
 _APART = 1e-6  # of the diagonal: how far from a triangle its two sides are examined
 _LARGEST_GAP = 1e-3  # of the diagonal: gaps that `join` may close
 _SHARPEST = 10.0  # degrees
@@ -320,8 +321,12 @@ def _caps(surface: Surface) -> list[np.ndarray]:
     rings = [ring for ring in _rings(surface.open_edges) if len(ring) > 2]
     ends = np.stack([surface.triangles, np.roll(surface.triangles, -1, axis=1)], axis=2).reshape(-1, 2)
     part = connect(len(surface.vertices), ends)[1]
-    fits = enumerate(_plane(surface.vertices[ring]) for ring in rings)
-    planes = {k: plane for k, plane in fits if plane is not None}
+    planes = {}
+    for k, ring in enumerate(rings):
+        points, whole = surface.vertices[ring], np.ptp(surface.vertices[part == part[ring[0]]], axis=0).max()
+        plane = _plane(points, _UNEVEN if np.ptp(points, axis=0).max() <= _SMALL * whole else _FLAT)
+        if plane is not None:
+            planes[k] = plane
     for k, (center, axes, tolerance) in list(planes.items()):
         away = (surface.vertices[part == part[rings[k][0]]] - center) @ axes[2]
         if np.abs(away).max() <= tolerance:
@@ -345,11 +350,14 @@ def _caps(surface: Surface) -> list[np.ndarray]:
     return caps
 
 
-def _plane(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, float] | None:
-    """Return the center, the axes (3, 3) and the tolerance of the plane through points (n, 3), or None if none fits."""
+def _plane(points: np.ndarray, flat: float) -> tuple[np.ndarray, np.ndarray, float] | None:
+    """Return the center, the axes (3, 3) and the tolerance of the plane through points (n, 3), or None if none fits.
+
+    - `flat`: the tolerance over the extent of the points.
+    """
     center = points.mean(axis=0)
     _, sizes, axes = np.linalg.svd(points - center, full_matrices=False)
-    tolerance = _FLAT * float(np.ptp(points, axis=0).max())
+    tolerance = flat * float(np.ptp(points, axis=0).max())
     away = np.abs((points - center) @ axes[2]).max()
     return (center, axes, tolerance) if away <= tolerance < sizes[1] else None
 

@@ -45,6 +45,20 @@ def test_every_format_brings_the_same_solid(tmp_path, kind):
     assert Solid.from_trimesh(mesh).measure == pytest.approx(ball.measure)
 
 
+def test_ends_of_a_vessel_that_are_not_quite_flat_are_closed():
+    """The border of a sheet is none: it is as large as its part."""
+    pytest.importorskip("manifold3d")
+    pipe = Solid.cylinder((0, 0, 0), (0, 0, 4), 0.5, edge=0.1)
+    wall = pipe.surface.triangles[np.abs(pipe.normals[:, 2]) < 0.5]
+    vertices = pipe.surface.vertices + np.outer(0.03 * pipe.surface.vertices[:, 0] ** 2 / 0.25, (0, 0, 1))
+    with pytest.warns(MismatchWarning, match="closed 2 flat holes"):
+        vessel = Solid(vertices, wall, repair=True)
+    assert vessel.measure == pytest.approx(pipe.measure, rel=0.01)
+    short = vertices * (1, 1, 0.1)
+    with pytest.raises(InputError, match="is open"):
+        Solid(short + np.outer(0.03 * vertices[:, 0] ** 2 / 0.25, (0, 0, 1)), wall, repair=True)
+
+
 def test_parts_of_step_files_are_united(tmp_path, monkeypatch):
     gmsh = pytest.importorskip("gmsh")
     gmsh.initialize(interruptible=False)
