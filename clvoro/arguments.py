@@ -39,6 +39,11 @@ def format_point(place: Iterable[float], unit: str = "") -> str:
     return "(" + ", ".join(_digits(float(x)) + unit for x in place) + ")"
 
 
+def counted(n: int, what: str) -> str:
+    """Return a number of things as text for messages: "1 cell", "2 cells"."""
+    return f"{n} {what}" if n == 1 else f"{n} {what}s"
+
+
 def _digits(x: float) -> str:
     return f"{x:.1f}".removesuffix(".0") if 1e5 <= abs(x) < 1e9 else f"{x:.6g}"
 

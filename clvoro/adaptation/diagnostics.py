@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from ..arguments import format_point, warn
+from ..arguments import counted, format_point, warn
 from ..errors import InputError, MismatchWarning, ObtuseTrianglesWarning, PrecisionWarning, SizeErrorWarning
 from ..geometry.domain import Domain
 from ..mesh.diagram import Diagram
@@ -147,8 +147,10 @@ def warn_of_errors(result: Result, size: Callable[[np.ndarray], np.ndarray]) -> 
         )
     else:
         why = diagram.domain.why_sizes_are_missed(result.points[worst], wanted, len(diagram))
+    empty = np.count_nonzero(~np.isfinite(amounts))
+    found = f"{counted(empty, 'cell')} of size 0" if empty else f"mean |e| is {mean:.2g}"
     warn(
-        f"the mesh does not meet its size field: mean |e| is {mean:.2g}, and a cell at {place} has the size "
+        f"the mesh does not meet its size field: {found}, and a cell at {place} has the size "
         f"{made:.3g} where the size field is {wanted:.3g}; {why}",
         SizeErrorWarning,
     )

@@ -14,7 +14,7 @@ import numpy as np
 import scipy
 import shapely
 
-from ..arguments import FIRST_ROWS, check_points, coincident_pair, format_point, warn
+from ..arguments import FIRST_ROWS, check_points, coincident_pair, counted, format_point, warn
 from ..errors import InputError, InputTypeError, MismatchWarning
 from ..geometry.domain import Domain
 from ..geometry.fixed_generators import FixedGenerators
@@ -152,8 +152,8 @@ def place_in_corners(
     if len(around.left_out):
         x = around.left_out[0]
         warn(
-            f"cells have no room at {len(around.left_out)} places on concave creases, the first at {format_point(x)}: "
-            "another crease or wall is near or meets it at a small angle, for the size there, "
+            f"cells have no room at {counted(len(around.left_out), 'place')} on concave creases, the first at "
+            f"{format_point(x)}: another crease or wall is near or meets it at a small angle, for the size there, "
             f"{float(np.asarray(size(x[None]))[0]):.3g}. Cells may be concave; use smaller sizes around it",
             MismatchWarning,
         )

@@ -36,8 +36,8 @@ exit codes:
   2    bad usage or input, or the output folder cannot be made;
        check: a file cannot be read
   3    no usable device
-  130  interrupted (Ctrl-C, SIGTERM, SIGHUP, SIGXCPU; the mesh so far and a
-       checkpoint have been written)
+  130  interrupted (Ctrl-C, SIGTERM, SIGHUP, SIGXCPU; the mesh so far and, if
+       steps are left, a checkpoint have been written)
 
 examples:
   clvoro run paper                      the paper's validation case, into out/paper

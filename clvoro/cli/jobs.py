@@ -21,7 +21,7 @@ import numpy as np
 
 from .. import earth
 from ..adaptation.options import Checkpoint, Options, arguments_of_run, uses, warn_of_unused
-from ..adaptation.run import INTERRUPTED, MISSES
+from ..adaptation.run import INTERRUPTED, MISSES, STOPPED
 from ..errors import Aborted, ClvoroError, InputError, Interrupted, SolverWarning
 from ..finite_volumes.gate import Solver
 from ..finite_volumes.solver_mesh import WallShape
@@ -138,7 +138,7 @@ class Job:
             self.peers.agree(lambda: self._write(adapter, size, results, where))
         self.missed = any(result.stop_reason.startswith(MISSES) for result in results.values())
         self._summarize(results, where, profiles)
-        self._tell_how_to_continue()
+        self._tell_how_to_continue(results)
         if self.solver is not None and self.peers.number == 0:
             self._check_for_solver(results)
         return self.interrupted
@@ -232,12 +232,13 @@ class Job:
                 result = stopped.result
             finally:
                 adapter.on_memory = adapter.on_build = adapter.on_work = None
-        self.interrupted = self.peers.any(self.interrupted or result.stop_reason == INTERRUPTED)
+        unfinished = result.stop_reason in (INTERRUPTED, STOPPED)
+        self.interrupted = self.peers.any(self.interrupted or unfinished)
         if not self.pieces:
             result = result.gather() or result
         if self._land is not None and result.parts is None:
             result = result.subset(earth.ocean(result, self._land))
-        return replace(result, stop_reason=INTERRUPTED) if self.interrupted else result
+        return replace(result, stop_reason=INTERRUPTED) if unfinished else result
 
     def _during(self, work: str, task: Callable[[], Any]) -> Any:
         return during(f"{self.case.name}: {work}", self.quiet, task)
@@ -300,9 +301,14 @@ class Job:
         every = Checkpoint.every if self.checkpoint_every is None else self.checkpoint_every
         return Checkpoint(self.checkpoint, every, self.resume)
 
-    def _tell_how_to_continue(self) -> None:
-        """After an interruption, print the command that continues."""
-        if not self.interrupted or self._state is None or not Path(str(self._state.path)).exists():
+    def _tell_how_to_continue(self, results: dict[str, Result]) -> None:
+        """After an interruption, print the command that continues, or that no step is left."""
+        if not self.interrupted or self._state is None:
+            return
+        if all(result.stop_reason != INTERRUPTED for result in results.values()):
+            print("clvoro: no step was left: the mesh is complete", file=sys.stderr)
+            return
+        if not Path(str(self._state.path)).exists():
             return
         words = list(self.command)
         for option in [word for word in words if word.startswith("--resume")]:
@@ -371,7 +377,7 @@ class Job:
             return
         tasks.append(partial(write_history, main, self.out / "history.csv"))
         tasks += [partial(write_history, result, self.out / f"history-{other}.csv") for other, result in others]
-        note = "; interrupted: the mesh beside it is that of an earlier step" * self.interrupted
+        note = "; interrupted: the mesh beside it is that of an earlier step" * (main.stop_reason == INTERRUPTED)
         header = (f"Written by clvoro {__version__} on {where}{note}.", "Repeat it with: clvoro run case.toml")
         repeatable = self._repeatable(results)
         tasks.append(partial(repeatable.write, self.out, header))

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..arguments import format_point
+from ..arguments import counted, format_point
 from ..geometry.sphere import Sphere
 from ..mesh.check.findings import Verdict
 
@@ -104,7 +104,7 @@ class SolverReport(Verdict):
         if self.area_change:
             changed = f"; straight walls change the area by {100 * self.area_change:+.2g} %"
         left = f"; {self.left_out}" if self.left_out else ""
-        head = f"{self.solver}: {verdict}; {self.cells} cells, {self.faces} faces{changed}{left}"
+        head = f"{self.solver}: {verdict}; {counted(self.cells, 'cell')}, {self.faces} faces{changed}{left}"
         columns = f"{'criterion':28}{'worst':>12}  {'limit':<12} {'verdict':<12}where"
         return "\n  ".join([head, columns, *map(str, self.criteria)])
 

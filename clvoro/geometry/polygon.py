@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import shapely
 
-from ..arguments import check_rows, format_point, warn
+from ..arguments import check_rows, counted, format_point, warn
 from ..connectivity import rows_and_places
 from ..errors import InputError, InputTypeError, MismatchWarning
 from ..opencl.engine import Engine, Traits
@@ -368,9 +368,9 @@ class Polygon(Domain):
         if pieces > 1:
             parts.append(f"{pieces} pieces")
         if holes:
-            parts.append(f"{holes} hole{'s' if holes > 1 else ''}")
+            parts.append(counted(holes, "hole"))
         if self.curves:
-            parts.append(f"{len(self.curves)} curve{'s' if len(self.curves) > 1 else ''}")
+            parts.append(counted(len(self.curves), "curve"))
         corners = format_point(self.lower), format_point(self.upper)
         return f"Polygon({', '.join(parts)} within {corners[0]} and {corners[1]})"
 

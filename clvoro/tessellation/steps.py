@@ -168,8 +168,8 @@ class SolidWalls(DomainSteps):
         if len(open_cells):
             where = f", the first at {format_point(domain_position(self.domain, t.points[int(open_cells[0])].get()))}"
         warn(
-            f"the walls do not bound {len(open_cells)} cells{where}, and {outside} generators are behind "
-            "the nearest wall: the solid is narrow or sharp for the size of cells there; use smaller sizes",
+            f"cells that the walls do not bound: {len(open_cells)}{where}; generators behind the nearest wall: "
+            f"{outside}. The solid is narrow or sharp for the size of cells there; use smaller sizes",
             MismatchWarning,
         )
 

@@ -275,6 +275,24 @@ def test_start_from_points(here):
     assert call("run", "out/warm/case.toml", "--no-report", "--quiet", "--out", "again") == cli.OK
 
 
+def test_an_interrupt_after_the_last_step_leaves_a_complete_mesh(here, monkeypatch, capsys):
+    plain = clvoro.Adapter.run
+
+    def run(*args, **options):
+        result = plain(*args, **options)
+        signal.raise_signal(signal.SIGINT)
+        return result
+
+    monkeypatch.setattr(clvoro.Adapter, "run", run)
+    (here / "one.toml").write_text(ROUND)
+    assert call("run", "one.toml", "--no-report") == cli.INTERRUPTED
+    said = capsys.readouterr().err
+    assert "no step was left: the mesh is complete" in said
+    assert "to go on" not in said
+    assert load(here / "out/one/mesh.npz").stop_reason == "plan completed"
+    assert "interrupted" not in (here / "out/one/case.toml").read_text()
+
+
 @pytest.mark.sparse(1)
 @pytest.mark.parametrize("last_step", [0, 2])
 def test_interrupt_keeps_what_there_is(here, monkeypatch, capsys, last_step):

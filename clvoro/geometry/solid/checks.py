@@ -9,7 +9,7 @@ import numpy as np
 import scipy
 import shapely
 
-from ...arguments import check_number, format_point
+from ...arguments import check_number, counted, format_point
 from ...errors import InputError
 from ..columns import Columns
 from ..surface import Skin, Surface
@@ -225,7 +225,7 @@ def repaired(skin: Skin) -> Skin:
     triangles, groups = triangles[rows].copy(), groups[rows]
     caps = _caps(Surface(vertices, triangles))
     if caps:
-        done.append(f"closed {len(caps)} flat hole{'s' * (len(caps) > 1)}")
+        done.append("closed " + counted(len(caps), "flat hole"))
         groups = np.concatenate([groups, np.repeat(len(names) + np.arange(len(caps)), list(map(len, caps)))])
         names += tuple(f"hole-{k + 1}" for k in range(len(caps)))
         triangles = np.concatenate([triangles, *caps])
@@ -237,7 +237,7 @@ def repaired(skin: Skin) -> Skin:
     if not met:
         turned ^= _turn_outwards(vertices, triangles, shells, nested=True)
     if turned[: len(rows)].any():
-        done.append(f"flipped {np.count_nonzero(turned[: len(rows)])} triangles")
+        done.append("flipped " + counted(np.count_nonzero(turned[: len(rows)]), "triangle"))
     if met:
         done.append(f"united {len(met)} parts that cross or touch")
         vertices, triangles, groups = _united(vertices, triangles, groups, met)

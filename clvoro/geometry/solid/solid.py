@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import scipy
 
-from ...arguments import check_rows, format_point, warn
+from ...arguments import check_rows, counted, format_point, warn
 from ...errors import InputError, MismatchWarning
 from ...files import pack_array, unpack_array
 from ..boundary_names import BoundaryNames, Walls
@@ -184,8 +184,8 @@ class Solid(Domain):
         if sharp.size:
             where = vertices[self.creases.edges[sharp[0]]].mean(axis=0)
             warn(
-                f"{name} has {len(sharp)} edges sharper than 10 degrees, the first at {format_point(where)}; cells "
-                "there are poor. Blunt them by about h, or use smaller sizes there",
+                f"{name} has {counted(len(sharp), 'edge')} sharper than 10 degrees, the first at "
+                f"{format_point(where)}; cells there are poor. Blunt them by about h, or use smaller sizes there",
                 MismatchWarning,
             )
 
@@ -382,7 +382,8 @@ class Solid(Domain):
     @property
     def unit_hint(self) -> str:  # type: ignore[override]
         """How long the solid is, and how to say the unit of a file."""
-        return f" (The solid is {max(self.extent):.3g} long; units='mm' says that a file is in millimeters.)"
+        files = "STEP files say their unit; of others units='mm' says that they are in millimeters"
+        return f" (The solid is {max(self.extent):.3g} long. {files}.)"
 
     # Where points are.
 

@@ -294,7 +294,7 @@ def test_edges_sharper_than_ten_degrees_are_warned_of():
     wedge = np.array([(0, 0, 0), (1, 0, 0), (1, 0.1, 0)])
     vertices = np.vstack([wedge, wedge + np.array([0, 0, 1])])
     triangles = [(0, 2, 1), (3, 4, 5), (0, 1, 4), (0, 4, 3), (1, 2, 5), (1, 5, 4), (2, 0, 3), (2, 3, 5)]
-    with pytest.warns(MismatchWarning, match="1 edges sharper than 10 degrees"):
+    with pytest.warns(MismatchWarning, match="1 edge sharper than 10 degrees"):
         Solid(vertices, triangles)
 
 
