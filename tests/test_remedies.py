@@ -3,6 +3,7 @@
 import ast
 import copy
 import errno
+import importlib
 import inspect
 import json
 import math
@@ -1196,6 +1197,8 @@ class Workplace(SimpleNamespace):
 
     def without(self, *names):
         """Let `import` not find a library, and import again a package that needs it."""
+        for name in names[1:]:  # the whole one is back afterwards
+            importlib.import_module(name)
         for name in list(sys.modules):
             if any(name == given or name.startswith(f"{given}.") for given in names):
                 self.patch.delitem(sys.modules, name)

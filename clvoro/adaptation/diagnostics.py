@@ -147,7 +147,7 @@ def warn_of_errors(result: Result, size: Callable[[np.ndarray], np.ndarray]) -> 
         )
     else:
         why = diagram.domain.why_sizes_are_missed(result.points[worst], wanted, len(diagram))
-    empty = np.count_nonzero(~np.isfinite(amounts))
+    empty = int(np.count_nonzero(~np.isfinite(amounts)))
     found = f"{counted(empty, 'cell')} of size 0" if empty else f"mean |e| is {mean:.2g}"
     warn(
         f"the mesh does not meet its size field: {found}, and a cell at {place} has the size "
