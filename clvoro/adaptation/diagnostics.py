@@ -10,6 +10,7 @@ import numpy as np
 from ..arguments import counted, format_point, warn
 from ..errors import InputError, MismatchWarning, ObtuseTrianglesWarning, PrecisionWarning, SizeErrorWarning
 from ..geometry.domain import Domain
+from ..geometry.gaps import NARROW_GAP
 from ..mesh.diagram import Diagram
 from ..mesh.results import Result
 from ..sizing import Sizing
@@ -36,6 +37,8 @@ run warns. The spacing of positions over the shortest edge is about the largest 
 MAX_SPACING = 1 / 16
 """Spacing of positions over the smallest h above which a run warns: random starts have pairs much closer than h."""
 
+_SAFELY = 0.99  # of the size below which the gap is wide and the body thick enough: it is rounded
+
 
 def warn_of_narrow_parts(domain: Domain, size: Callable[[np.ndarray], np.ndarray]) -> None:
     """Warn if cells of the target size do not fit between walls of `domain`, in many places, or into a dead end.
@@ -49,8 +52,16 @@ def warn_of_narrow_parts(domain: Domain, size: Callable[[np.ndarray], np.ndarray
     if found is None:
         return
     here = f"{found.width:.3g} wide at {format_point(found.place)}, where the size field is {found.size:.3g}; "
+    remedy = domain.remedy_for_narrow_parts
     if strait is not None:
         text = f"the domain is narrower than half a cell: {here}cells there are long and reach from wall to wall"
+    elif found.behind:
+        text = (
+            f"{found.share:.0%} of the walls are in gaps of less than {NARROW_GAP:g} cells beside bodies thinner than "
+            f"a cell: such a gap is {here}a body beside it is {found.behind:.3g} thick. Such meshes take longer, and "
+            "OpenFOAM may not accept cells there"
+        )
+        remedy = f"Use sizes of at most {_SAFELY * min(found.behind, found.width / NARROW_GAP):.3g} there"
     elif found.share:
         text = (
             f"{found.share:.0%} of the walls are nearer than a cell to one that faces them: the domain is {here}such "
@@ -58,7 +69,7 @@ def warn_of_narrow_parts(domain: Domain, size: Callable[[np.ndarray], np.ndarray
         )
     else:
         text = f"the domain has a dead end that is narrower than a cell: {here}cells there have poor shapes"
-    warn(f"{text}. {domain.remedy_for_narrow_parts}", MismatchWarning)
+    warn(f"{text}. {remedy}", MismatchWarning)
 
 
 def warn_of_moved_points(fixed: np.ndarray, diagram: Diagram, sizes: np.ndarray) -> None:

@@ -21,6 +21,8 @@ degrees do not face each other."""
 NARROW = 0.5
 """A gap is too narrow if its width is less than this times the target size. A cell from wall to wall is then more than
 four times as long as wide."""
+NARROW_GAP = 3.0
+"""A gap beside a body thinner than a cell is too narrow if its width is less than this times the target size."""
 _FAN = math.radians(7.5)  # between the directions from a corner
 _PER_RADIUS = 4  # samples of an edge per radius of the balls at it
 _MAX_SAMPLES = 2048  # of one edge
@@ -74,12 +76,14 @@ class NarrowPart:
     """A part of a domain that is narrow for its cells: a place (d,), the width and the target size there.
 
     - `share`: that of all walls which are nearer to each other than a cell, where this is known.
+    - `behind`: how thick the body behind a wall of a gap is, where it is thinner than a cell.
     """
 
     place: np.ndarray
     width: float
     size: float
     share: float = 0.0
+    behind: float = 0.0
 
 
 def find_narrow_parts(

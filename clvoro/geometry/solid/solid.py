@@ -20,7 +20,7 @@ from ..boundary_names import BoundaryNames, Walls
 from ..box import Box
 from ..columns import Columns
 from ..domain import Domain
-from ..gaps import NARROW, NarrowPart
+from ..gaps import NARROW, NARROW_GAP, NarrowPart
 from ..nearest_triangles import Feet, NearestTriangles, heights_over
 from ..polygon import Polygon
 from ..shapes import Edges
@@ -50,6 +50,7 @@ if TYPE_CHECKING:
 
 _ON = 1e-12  # of the diagonal: points this close to the surface lie on it
 _PROBES = 4096  # places on the surface from which widths are measured
+_MANY_CROWDED = 200  # cells at the walls of narrow gaps beside thin bodies, from which a run says so before it
 _MANY_THIN = 0.1  # share of the surface: if more of it is nearer to a facing wall than a cell, a run says so before it
 _FACING = -0.7  # product of the normals of two walls that face each other
 _WRAPPED = 150.0  # degrees: a wrap has no creases
@@ -520,6 +521,9 @@ class Solid(Domain):
     def narrow_parts(self, size: Callable[[np.ndarray], np.ndarray]) -> tuple[NarrowPart | None, NarrowPart | None]:
         """Return where the solid is narrower than half a cell, or where it is narrowest if many walls are that near.
 
+        If few are, the second is where many cells are in gaps of less than 3 cells beside bodies thinner than a cell,
+        as between fins: cells on both sides of such a body reach through it.
+
         The width is that of thin parts and of gaps between bodies, measured inwards from a sample of the surface. Sharp
         edges, where two walls meet, do not count.
         """
@@ -535,7 +539,28 @@ class Solid(Domain):
         worst = int((width / h).argmin())
         place = begin[worst] - 0.5 * width[worst] * self.normals[item[worst]]
         part = NarrowPart(place, float(width[worst]), float(h[worst]), share)
-        return part if part.width < NARROW * part.size else None, part if share > _MANY_THIN else None
+        strait = part if part.width < NARROW * part.size else None
+        return strait, part if share > _MANY_THIN else self._crowded(
+            item, np.bincount(np.searchsorted(item, even), minlength=len(item)), h
+        )
+
+    def _crowded(self, items: np.ndarray, counts: np.ndarray, h: np.ndarray) -> NarrowPart | None:
+        """Return the narrowest gap beside bodies thinner than a cell, if many cells are there; see `narrow_parts`.
+
+        - `items`, `h` (k,) int and float: triangles, and the sizes there.
+        - `counts` (k,) int: how many equal parts of the area each stands for.
+        """
+        begin, normals, patch = self.surface.corners[items].mean(axis=1), self.normals[items], self.patch[items]
+        gap, behind = np.full(len(items), math.inf), self.clearance(begin, normals, h, patch, behind=True)
+        rows = np.flatnonzero(behind < h)
+        gap[rows] = self.clearance(begin[rows], -normals[rows], NARROW_GAP * h[rows], patch[rows])
+        rows = np.flatnonzero(np.isfinite(gap))
+        share = counts[rows] / counts.sum()
+        if float((share * self._areas.sum() / h[rows] ** 2).sum()) < _MANY_CROWDED:
+            return None
+        k = rows[int((gap[rows] / h[rows]).argmin())]
+        place = begin[k] - 0.5 * gap[k] * normals[k]
+        return NarrowPart(place, float(gap[k]), float(h[k]), float(share.sum()), float(behind[k]))
 
     def widths(self, items: np.ndarray, reach: np.ndarray) -> np.ndarray:
         """Return how far the wall is that faces each of the triangles `items` (k,), up to `reach` (k,); else inf.
@@ -544,10 +569,13 @@ class Solid(Domain):
         """
         return self.clearance(self.surface.corners[items].mean(axis=1), -self.normals[items], reach, self.patch[items])
 
-    def clearance(self, points: np.ndarray, directions: np.ndarray, reach: np.ndarray, patch: np.ndarray) -> np.ndarray:
+    def clearance(
+        self, points: np.ndarray, directions: np.ndarray, reach: np.ndarray, patch: np.ndarray, behind: bool = False
+    ) -> np.ndarray:
         """Return how far the wall is that faces `points` (k, 3) of the surface, up to `reach` (k,); else inf; (k,).
 
         Along unit vectors `directions` (k, 3). Walls that share a crease with `patch` (k,) do not count.
+        With `behind` these vectors lead out of the solid, to where it begins again.
         """
         width = np.full(len(points), math.inf)
         meets = np.sort(self.creases.patches, axis=1) @ (self.n_patches, 1)
@@ -556,7 +584,7 @@ class Solid(Domain):
             begin, along, far, mine = points[part], directions[part], reach[part], patch[part]
             end = begin + far[:, None] * along
             who, other = self.surface.tree.meeting(np.minimum(begin, end), np.maximum(begin, end))
-            facing = np.einsum("ij,ij->i", along[who], self.normals[other]) > -_FACING
+            facing = (-1 if behind else 1) * np.einsum("ij,ij->i", along[who], self.normals[other]) > -_FACING
             pair = np.sort(np.column_stack([mine[who], self.patch[other]]), axis=1) @ (self.n_patches, 1)
             rows = np.flatnonzero(facing & ~np.isin(pair, meets))
             share = pierced(begin[who[rows]], end[who[rows]], self.surface.corners[other[rows]])

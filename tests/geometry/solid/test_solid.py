@@ -8,6 +8,7 @@ import pytest
 import shapely
 
 from clvoro import Polygon, Solid
+from clvoro.adaptation.diagnostics import warn_of_narrow_parts
 from clvoro.errors import InputError, MismatchWarning
 from clvoro.geometry.columns import Columns
 from clvoro.geometry.triangles import packed_rows, packed_weights, pierced
@@ -158,6 +159,27 @@ def test_thin_parts_and_gaps_are_found():
     assert (strait, thin.share) == (None, pytest.approx(2 / 2.6, rel=0.01))
     for solid in (SOLIDS["box"], SOLIDS["ball"], Solid.cone((0, 0, 0), (0, 0, 1), 0.2)):
         assert solid.narrow_parts(lambda x: np.full(len(x), 0.1)) == (None, None)
+
+
+@pytest.mark.parametrize(
+    ("gap", "thick", "h", "found"),
+    [(3, 1, 1.5, True), (3, 1, 1.2, True), (3, 1, 0.99, False), (6, 1, 1.5, False), (3, 2, 1.5, False)],
+)
+def test_gaps_of_few_cells_between_thin_fins_are_found(gap, thick, h, found):
+    """Thicker fins, wider gaps and smaller cells are not found; the message's size is among these."""
+    pitch = gap + thick
+    body = shapely.union_all(
+        [shapely.box(0, 0, 4 * pitch, 5), *[shapely.box(x, 4, x + thick, 20) for x in range(2, 4 * pitch, pitch)]]
+    )
+    fins = Solid.extruded(Polygon.from_shapely(body), 0, 20).outside(((-9, -9, -9), (4 * pitch + 9, 30, 30)))
+    strait, gaps = fins.narrow_parts(lambda x: np.full(len(x), h))
+    assert strait is None
+    assert (gaps is not None) == found
+    if found:
+        assert (gaps.width, gaps.behind) == pytest.approx((3, 1))
+        assert fins.contains(gaps.place[None])[0]
+        with pytest.warns(MismatchWarning, match="gaps of less than 3 cells .* Use sizes of at most 0.99 there"):
+            warn_of_narrow_parts(fins, lambda x: np.full(len(x), h))
 
 
 def test_voxels_are_recognized_and_have_a_remedy():
