@@ -226,10 +226,17 @@ def test_vertices_are_no_farther_from_a_ball_than_plane_polygons_need(ctx):
 
 
 def test_few_rejected_cells_are_cured_in_a_sheet_half_as_thick_as_a_cell(ctx):
-    """Though they are a large share: the mesh has no inverted cell, and the warning of sizes no negative one."""
+    """Though they are a large share: the mesh has no inverted cell, and the warning of sizes no negative one.
+
+    The progress counts them.
+    """
+    adapter, told = clvoro.Adapter(ctx), []
+    adapter.on_work = told.append
     sheet = clvoro.Polygon([(0, 0), (1.6, 0), (1.6, 0.2), (0.2, 0.2), (0.2, 1.4), (0, 1.4)])
     with pytest.warns(MismatchWarning, match=r"of the walls are nearer than a cell|narrower than half a cell"):
-        mesh = clvoro.Adapter(ctx).run(clvoro.Solid.extruded(sheet, 0, 1.2), 0.4, effort="fast")
+        mesh = adapter.run(clvoro.Solid.extruded(sheet, 0, 1.2), 0.4, effort="fast")
+    counted = [part for part in told if part.startswith("cells that are rejected at walls: ")]
+    assert len(counted) > 10
     failed = {c.name for c in mesh.check("openfoam").criteria if c.demanded and not c.ok}
     assert failed <= {"determinant"}  # of `checkMesh -allGeometry` only: all faces between cells are upright there
 

@@ -449,9 +449,8 @@ def _finished(
     """
     near, faces, home, own, rejected, cures = made.near, made.faces, made.home, made.own, made.rejected, None
     if len(rejected) and not (spares and _are_many(near, rejected)):
-        tell("cells that are rejected at walls")
         names, h = near.numbers[home], near.sizes[home]
-        faces, origin, own, rejected, cures = cured(surface, faces, names, own, h, rejected, earlier)
+        faces, origin, own, rejected, cures = cured(surface, faces, names, own, h, rejected, earlier, tell=tell)
         home = home[origin]
     if not own.all():
         centroids = faces.measures.geometry.centroids
