@@ -68,7 +68,7 @@ class Prepared:
     """(n,) int or None. For each of `points` its index in those of the caller, or -1; None if all are those of the
     caller."""
     even: tuple[float, ...]
-    """Sizes that many cells have. If there are any, and the caller gives no points, lattices are there at the start."""
+    """Sizes that many cells have. Where h is one of them, a run without given points starts from a lattice."""
     memory: float
     """Estimated device memory of the run, or of reading its diagram, in bytes."""
 
@@ -140,9 +140,9 @@ def prepare(stages: Stages, arguments: RunArguments, max_levels: int | None = No
 
 
 def _even_sizes(domain: Domain, count: CellCount, options: Options) -> tuple[float, ...]:
-    """Return the sizes, in space, of the lattices that a run without given points begins with.
+    """Return the sizes of the cells of the lattices that a run without given points starts from, in space.
 
-    Together at least a half of the cells have these sizes.
+    At least half of all cells have one of these sizes; else there are none.
     """
     if not options.multilevel or options.start != "density" or options.levels != "auto" or count.tree is None:
         return ()
@@ -387,7 +387,7 @@ def start(prepared: Prepared) -> MeshState:
 
 
 def _sample(prepared: Prepared) -> np.ndarray:
-    """Return the generators of the coarsest level, where the caller gives none."""
+    """Return the generators at the start of a run without given points: those of the coarsest level."""
     setup, options = prepared.setup, prepared.options
     domain, real = setup.domain, setup.stages.engine.real
     n = _cells_at_start(prepared)

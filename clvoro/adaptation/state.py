@@ -511,7 +511,7 @@ class MeshState:
         return self._replace_by(changed)
 
     def delete_lost(self, lost: np.ndarray) -> int:
-        """Delete generators that are not fixed where `lost` (n,) is true; return their number."""
+        """Delete the generators where `lost` (n,) is true, but no fixed ones; return how many are deleted."""
         sites = np.zeros((2, self.t.rows), np.uint64)
         sites[1, : self.n] = lost & (self.labels.get()[: self.n] >= self.fixed)
         none, chosen = (self.engine.upload(which, np.uint64) for which in sites)

@@ -36,9 +36,11 @@ COARSEST = {2: 1400, 3: 1500}
 """Approximate number of cells of the coarsest level by dimension."""
 LATTICE = {2: float("inf"), 3: 1000}
 """Least number of cells of equal sizes that start from a lattice, by dimension. In 2D lattices form in any run."""
-LATTICE_GLIDE, LATTICE_CELLS, MOST_GLIDE = 0.5, 4000.0, 5.0
-"""Steps of gliding after a start from a lattice, over those without coarser levels, for many cells; number of cells
-that take twice as many, as most of them are near walls; largest such factor."""
+LATTICE_GLIDE = 0.5
+"""Number of gliding steps of a run that starts from a lattice, over that of a run from random points on one level."""
+LATTICE_CELLS, MOST_GLIDE = 4000.0, 5.0
+"""A run of n cells takes 1 + (`LATTICE_CELLS` / n)^2 times as many of them, but at most `MOST_GLIDE` times: most of few
+cells are near walls, where the lattice ends."""
 PART_CELLS = {2: 100_000, 3: 50_000}
 """Least number of cells of a part on coarser levels, by dimension: on levels of fewer cells not all parts work."""
 CELLS_ACROSS = 5.0

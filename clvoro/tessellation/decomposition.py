@@ -62,9 +62,10 @@ def _curve(dim: int) -> np.ndarray:
 
 
 def coarse_keys(axes: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
-    """Return `hilbert_keys` with ``16 // d`` bits of points given by their coordinates `axes` (d, n), (n,) uint16.
+    """Return short `hilbert_keys` of n points, (n,) uint16, with ``16 // d`` bits for each coordinate.
 
-    They are the first bits of longer keys, and take a tenth of the time.
+    `axes` (d, n) are the coordinates of the points, one row for each axis. The keys are the first bits of
+    longer keys, and take a tenth of the time.
     """
     dim, n = axes.shape
     side, cells = 2 ** (16 // dim), np.zeros(n, np.int32)
@@ -99,7 +100,10 @@ def divide(keys: np.ndarray, dim: int, peers: Peers, bits: int = BITS) -> tuple[
 
 
 def owners_of(counts: np.ndarray, parts: int) -> np.ndarray:
-    """Return the part of each block, (b,) uint16, in runs of nearly equal numbers of generators, `counts` (b,)."""
+    """Return the part that owns each block, (b,) uint16.
+
+    Parts own runs of blocks with nearly equal numbers of generators; `counts` (b,) are those of the blocks.
+    """
     middle = np.cumsum(counts) - counts / 2
     return np.minimum(middle * parts / max(counts.sum(), 1), parts - 1).astype(np.uint16)
 

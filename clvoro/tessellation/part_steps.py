@@ -47,8 +47,8 @@ those of neighboring ghosts must be final, too."""
 LAST_LABEL = 2**31 - 1
 """Label of the first ghost generator outside of a polygon; the others have those before it."""
 RUN, AHEAD, CACHED = 32, 4, 1 << 13
-"""Number of successive generators from which their spacing is estimated, of the next ones that are compared, and of
-those that are compared at a time."""
+"""Spacings are estimated along the curve: each generator is compared with the `AHEAD` next ones, and `RUN` successive
+generators give one spacing. `CACHED` generators are compared at a time."""
 JUMP = 12
 """Number of spacings between successive generators beyond which a new chunk begins."""
 GROWTH, SKIN, SHARE = 1.4, 0.25, 0.4
@@ -529,7 +529,7 @@ class PartSteps(DomainSteps):
             if convex is not None and self._cut is not None:
                 t = self._cut.finish_updated(convex, part.points, part.count, attempt)
             if part.ghosts is None:
-                # Cells that fitted are known by the diagram that an update has returned.
+                # The next update finds the cells that it has checked before by this diagram.
                 return None if t is None else replace(t, part=part, whole=t)
             needed = engine.scratch((n, 2), np.float32)
             if t is not None:

@@ -72,11 +72,11 @@ class CountOfMesh:
             return
         h = mesh.h.get()
         mesh.h.set(h * factors)
-        lack = round(mesh.missing_cells())
+        lack, lost = round(mesh.missing_cells()), np.isinf(factors)
         mesh.h.set(h)
-        if lack:
+        if lack or lost.any():
             mesh.stages.clear_poisson()
-            lack += mesh.delete_lost(np.isinf(factors))
+            lack += mesh.delete_lost(lost)
             mesh.insert_delete(0, mesh.total + lack, climb=False, most=max_cells(run))
 
 

@@ -43,7 +43,10 @@ def _slopes(points: np.ndarray, values: np.ndarray) -> np.ndarray:
 
 
 def _which(sizes: Sequence[float], low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """Return the index of the first of `sizes` that all from `low` to `high` (n,) are, or their number, (n,) int."""
+    """Return the index of the first of `sizes` within one percent of `low` and `high` (n,), (n,) int.
+
+    It is ``len(sizes)`` if there is none.
+    """
     same = [(low * _EVEN >= size) & (high <= size * _EVEN) for size in sizes]
     return np.argmax([*same, np.ones(len(low), bool)], axis=0)
 
@@ -118,7 +121,7 @@ class DensityTree:
         return float(self._errors.sum())
 
     def even_sizes(self, least: float) -> dict[float, float]:
-        """Return the sizes that at least `least` cells have, to one percent, and the numbers of these cells."""
+        """Return each size that at least `least` cells have within one percent, with the number of these cells."""
         even = np.flatnonzero(self.coverage.occupied & (self._high <= _EVEN * self._low))
         even = even[np.argsort(self._low[even], kind="stable")]
         found = {}
@@ -135,13 +138,13 @@ class DensityTree:
         return found
 
     def leave_out(self, sizes: Sequence[float]) -> None:
-        """Set the number of cells to 0 in boxes where h is one of `sizes`."""
+        """Set the number of cells to 0 in boxes where h is within one percent of one of `sizes`."""
         self.cells[_which(sizes, self._low, self._high) < len(sizes)] = 0
 
     def which_size(self, points: np.ndarray, sizes: Sequence[float]) -> np.ndarray:
-        """Return for each of `points` (n, d) the index of the first of `sizes` that h is, to one percent, (n,) int.
+        """Return the index of the first of `sizes` within one percent of h at `points` (n, d), (n,) int.
 
-        It is ``len(sizes)`` if h is none of them.
+        It is ``len(sizes)`` if there is none.
         """
         h = self.sizes(points)
         return _which(sizes, h, h)

@@ -351,7 +351,7 @@ def _caps(surface: Surface) -> list[np.ndarray]:
 
 
 def _plane(points: np.ndarray, flat: float) -> tuple[np.ndarray, np.ndarray, float] | None:
-    """Return the center, the axes (3, 3) and the tolerance of the plane through points (n, 3), or None if none fits.
+    """Return the plane nearest to points (n, 3): its center, axes (3, 3) and tolerance; None if points are farther.
 
     - `flat`: the tolerance over the extent of the points.
     """

@@ -534,28 +534,27 @@ class Solid(Domain):
         begin = self.surface.corners[item].mean(axis=1)
         h = np.asarray(size(begin), float)
         width = self.widths(item, h)
-        share = float((width < h)[np.searchsorted(item, even)].mean())
+        share_of = np.bincount(np.searchsorted(item, even), minlength=len(item)) / _PROBES
+        share = float(share_of[width < h].sum())
         width = np.minimum(width, float(self.extent.min()))
         worst = int((width / h).argmin())
         place = begin[worst] - 0.5 * width[worst] * self.normals[item[worst]]
         part = NarrowPart(place, float(width[worst]), float(h[worst]), share)
         strait = part if part.width < NARROW * part.size else None
-        return strait, part if share > _MANY_THIN else self._crowded(
-            item, np.bincount(np.searchsorted(item, even), minlength=len(item)), h
-        )
+        return strait, part if share > _MANY_THIN else self._crowded(item, share_of, h)
 
-    def _crowded(self, items: np.ndarray, counts: np.ndarray, h: np.ndarray) -> NarrowPart | None:
+    def _crowded(self, items: np.ndarray, share_of: np.ndarray, h: np.ndarray) -> NarrowPart | None:
         """Return the narrowest gap beside bodies thinner than a cell, if many cells are there; see `narrow_parts`.
 
         - `items`, `h` (k,) int and float: triangles, and the sizes there.
-        - `counts` (k,) int: how many equal parts of the area each stands for.
+        - `share_of` (k,) float: the share of the surface that each stands for.
         """
         begin, normals, patch = self.surface.corners[items].mean(axis=1), self.normals[items], self.patch[items]
         gap, behind = np.full(len(items), math.inf), self.clearance(begin, normals, h, patch, behind=True)
         rows = np.flatnonzero(behind < h)
         gap[rows] = self.clearance(begin[rows], -normals[rows], NARROW_GAP * h[rows], patch[rows])
         rows = np.flatnonzero(np.isfinite(gap))
-        share = counts[rows] / counts.sum()
+        share = share_of[rows]
         if float((share * self._areas.sum() / h[rows] ** 2).sum()) < _MANY_CROWDED:
             return None
         k = rows[int((gap[rows] / h[rows]).argmin())]

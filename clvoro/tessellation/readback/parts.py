@@ -75,9 +75,9 @@ def fetch_part(engine: Engine, domain: Domain, t: Tessellation, labels: cla.Arra
 
 
 class LaterDiagram(Diagram):
-    """A diagram of a part that is read as a whole when more than its points is used.
+    """The diagram of a part. All arrays but its points are read from the device when one of them is first used.
 
-    `rows` returns its cells as `CellRows`, which are read no later than the diagram.
+    `rows` returns its cells as `CellRows`. They are read at the latest with these arrays.
     """
 
     def __init__(self, points: np.ndarray, rows: Callable[[], CellRows], read: Callable[[], Diagram]) -> None:
